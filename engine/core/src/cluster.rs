@@ -1,0 +1,347 @@
+//! From points to clusters: the sums that make a node, added point by point in leaves and child by child above.
+
+use crate::morton::Quantizer;
+use crate::node::NodeAttributes;
+use crate::pack::pack_harmonics;
+use crate::point::PointRecord;
+use crate::sh::{SH_TERMS, project_cosine};
+use crate::voxel::Voxel;
+use glam::{DMat3, DVec3, Vec3};
+
+/// Sums over the points of a voxel. Everything is additive, so a parent is the sum of its children; sums stay in f64 until
+/// [`Self::finalize`] packs them, and packed values are never summed again.
+#[derive(Clone, Debug)]
+pub struct ClusterAccumulator {
+    /// Harmonics of (projected front area, power r, g, b).
+    sh: [[f64; 4]; SH_TERMS],
+    area: f64,
+    /// Sum of area times position.
+    first_moment: DVec3,
+    /// Sum of area times position outer position, with the disc's own extent: xx, yy, zz, xy, xz, yz.
+    second_moment: [f64; 6],
+    /// Sum of area times normal.
+    normal: DVec3,
+    /// Sum of area times normal outer normal: xx, yy, zz, xy, xz, yz.
+    normal_moment: [f64; 6],
+    radius_max: f32,
+    point_count: u64,
+}
+
+/// A node's attributes, ready to be packed, and what packing lost.
+#[derive(Clone, Copy, Debug)]
+pub struct FinalizedCluster {
+    /// The attributes.
+    pub attributes: NodeAttributes,
+    /// Harmonics that left the range of a half-precision float.
+    pub clamped: u32,
+}
+
+impl Default for ClusterAccumulator {
+    fn default() -> Self {
+        Self {
+            sh: [[0.0; 4]; SH_TERMS],
+            area: 0.0,
+            first_moment: DVec3::ZERO,
+            second_moment: [0.0; 6],
+            normal: DVec3::ZERO,
+            normal_moment: [0.0; 6],
+            radius_max: 0.0,
+            point_count: 0,
+        }
+    }
+}
+
+impl ClusterAccumulator {
+    /// Points summed so far.
+    pub fn point_count(&self) -> u64 {
+        self.point_count
+    }
+
+    /// Adds one point. Moments are taken about the lattice's origin, which keeps them exact far from the world's.
+    pub fn add(&mut self, point: &PointRecord, quantizer: &Quantizer) {
+        let normal = point.normal();
+        let area = f64::from(point.area());
+        let sides = point.sides();
+        let front = project_cosine(normal);
+        let back = project_cosine(-normal);
+        for (term, (f, b)) in self.sh.iter_mut().zip(front.iter().zip(&back)) {
+            let (f, b) = (f64::from(*f), f64::from(*b));
+            term[0] += area * f;
+            for channel in 0..3 {
+                term[channel + 1] += area * (f * f64::from(sides.front[channel]) + b * f64::from(sides.back[channel]));
+            }
+        }
+        let position = DVec3::from_array(point.position.map(f64::from)) - DVec3::from_array(quantizer.origin);
+        let normal = normal.as_dvec3();
+        let spread = f64::from(point.radius) * f64::from(point.radius) / 4.0;
+        self.area += area;
+        self.first_moment += position * area;
+        self.normal += normal * area;
+        let outer_position = outer(position);
+        let outer_normal = outer(normal);
+        for i in 0..6 {
+            let identity = if i < 3 { 1.0 } else { 0.0 };
+            self.second_moment[i] += area * (outer_position[i] + spread * (identity - outer_normal[i]));
+            self.normal_moment[i] += area * outer_normal[i];
+        }
+        self.radius_max = self.radius_max.max(point.radius);
+        self.point_count += 1;
+    }
+
+    /// Adds the sums of a child. Call in octant order: the result then depends on the points alone.
+    pub fn merge(&mut self, child: &Self) {
+        for (term, other) in self.sh.iter_mut().zip(&child.sh) {
+            for (value, add) in term.iter_mut().zip(other) {
+                *value += add;
+            }
+        }
+        self.area += child.area;
+        self.first_moment += child.first_moment;
+        self.normal += child.normal;
+        for i in 0..6 {
+            self.second_moment[i] += child.second_moment[i];
+            self.normal_moment[i] += child.normal_moment[i];
+        }
+        self.radius_max = self.radius_max.max(child.radius_max);
+        self.point_count += child.point_count;
+    }
+
+    /// Turns the sums into the attributes of `voxel`'s node.
+    ///
+    /// # Panics
+    /// If no point was added: a voxel without points has no node.
+    pub fn finalize(&self, voxel: Voxel, quantizer: &Quantizer) -> FinalizedCluster {
+        assert!(self.point_count > 0, "a cluster has at least one point");
+        let edge = voxel.edge(quantizer);
+        let mean = self.first_moment / self.area;
+        let mean_outer = outer(mean);
+        let mut covariance = [0.0f32; 6];
+        for i in 0..6 {
+            let variance = self.second_moment[i] / self.area - mean_outer[i];
+            let variance = if i < 3 { variance.max(0.0) } else { variance };
+            covariance[i] = (variance / (edge * edge)) as f32;
+        }
+        let axis = self.axis();
+        let aligned = quadratic_form(&self.normal_moment, axis) / self.area;
+        let origin = DVec3::from_array(quantizer.origin);
+        let corner = DVec3::from_array(voxel.min_corner(quantizer)) - origin;
+        let section = plane_section_area((mean - corner) / edge, axis) * edge * edge;
+        let (sh, clamped) = pack_harmonics(&self.sh, edge);
+        let attributes = NodeAttributes {
+            centroid: (mean + origin).as_vec3(),
+            axis: axis.as_vec3(),
+            radius_ratio: self.radius_max / edge as f32,
+            spread: (1.0 - aligned).max(0.0).sqrt() as f32,
+            fill: if section > 0.0 {
+                (self.area / section) as f32
+            } else {
+                0.0
+            },
+            covariance,
+            sh,
+        };
+        FinalizedCluster { attributes, clamped }
+    }
+
+    /// Principal axis of the normals, on the side that most area faces: the dominant eigenvector of their second moment.
+    fn axis(&self) -> DVec3 {
+        // Enough for a flat cluster to converge to machine precision; a round one has no axis to converge to.
+        const STEPS: usize = 12;
+        let [xx, yy, zz, xy, xz, yz] = self.normal_moment;
+        let matrix = DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz));
+        // The columns of a matrix of rank one are multiples of the axis; the longest is the safest start.
+        let columns = [matrix.x_axis, matrix.y_axis, matrix.z_axis];
+        let start = columns
+            .into_iter()
+            .max_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
+        let mut axis = start.and_then(DVec3::try_normalize).unwrap_or(DVec3::Z);
+        for _ in 0..STEPS {
+            axis = (matrix * axis).try_normalize().unwrap_or(axis);
+        }
+        if axis.dot(self.normal) < 0.0 { -axis } else { axis }
+    }
+}
+
+/// Upper triangle of `v v^T`: xx, yy, zz, xy, xz, yz.
+fn outer(v: DVec3) -> [f64; 6] {
+    [v.x * v.x, v.y * v.y, v.z * v.z, v.x * v.y, v.x * v.z, v.y * v.z]
+}
+
+/// `v^T M v` for a symmetric matrix as xx, yy, zz, xy, xz, yz.
+fn quadratic_form(m: &[f64; 6], v: DVec3) -> f64 {
+    let o = outer(v);
+    m[0] * o[0] + m[1] * o[1] + m[2] * o[2] + 2.0 * (m[3] * o[3] + m[4] * o[4] + m[5] * o[5])
+}
+
+/// Area in which the plane through `through` with unit `normal` cuts the unit cube.
+fn plane_section_area(through: DVec3, normal: DVec3) -> f64 {
+    /// Longer than any chord of the unit cube around a point in it.
+    const REACH: f64 = 2.0;
+    /// A square cut by six half-spaces.
+    const CORNERS_MAX: usize = 10;
+    let (u, v) = normal.any_orthonormal_pair();
+    let mut polygon = [DVec3::ZERO; CORNERS_MAX];
+    polygon[..4].copy_from_slice(&[
+        through - u * REACH - v * REACH,
+        through + u * REACH - v * REACH,
+        through + u * REACH + v * REACH,
+        through - u * REACH + v * REACH,
+    ]);
+    let mut corners = 4;
+    for axis in 0..3 {
+        for (sign, offset) in [(1.0, 0.0), (-1.0, 1.0)] {
+            let inside = |p: DVec3| sign * p[axis] + offset;
+            let mut clipped = [DVec3::ZERO; CORNERS_MAX];
+            let mut kept = 0;
+            for i in 0..corners {
+                let (a, b) = (polygon[i], polygon[(i + 1) % corners]);
+                let (da, db) = (inside(a), inside(b));
+                if da >= 0.0 && kept < CORNERS_MAX {
+                    clipped[kept] = a;
+                    kept += 1;
+                }
+                if (da >= 0.0) != (db >= 0.0) && kept < CORNERS_MAX {
+                    clipped[kept] = a + (b - a) * (da / (da - db));
+                    kept += 1;
+                }
+            }
+            (polygon, corners) = (clipped, kept);
+        }
+    }
+    let doubled: DVec3 = (1..corners.max(1))
+        .map(|i| polygon[i - 1].cross(polygon[i]))
+        .sum::<DVec3>()
+        + if corners > 0 {
+            polygon[corners - 1].cross(polygon[0])
+        } else {
+            DVec3::ZERO
+        };
+    doubled.dot(normal).abs() / 2.0
+}
+
+/// Front-side radiance of a flat cluster and of its back, from harmonics evaluated at the axis and opposite to it.
+///
+/// A disc facing the axis shows `cosine_lobe(1)` of itself there and `cosine_lobe(-1)` from behind, so the two powers are a
+/// two-by-two system. Inputs and outputs are power (radiance times area); exact when every normal is plus or minus the axis.
+#[inline]
+pub fn separate_sides(toward_axis: Vec3, against_axis: Vec3) -> (Vec3, Vec3) {
+    const SAME: f32 = 1.0625;
+    const OPPOSITE: f32 = 0.0625;
+    const SCALE: f32 = 1.0 / (SAME * SAME - OPPOSITE * OPPOSITE);
+    let front = (toward_axis * SAME - against_axis * OPPOSITE) * SCALE;
+    let back = (against_axis * SAME - toward_axis * OPPOSITE) * SCALE;
+    (front.max(Vec3::ZERO), back.max(Vec3::ZERO))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bounds::Bounds;
+    use crate::pack::area_normaliser;
+    use crate::point::Sides;
+    use crate::sh::basis;
+
+    fn quantizer() -> Quantizer {
+        Quantizer::from_bounds(&Bounds {
+            min: [-1.0; 3],
+            max: [1.0; 3],
+        })
+        .unwrap()
+    }
+
+    /// A square of side 2 through the middle of the root voxel, facing z, in 20 x 20 points.
+    fn wall(front: [f32; 3], back: [f32; 3]) -> Vec<PointRecord> {
+        let spacing = 2.0 / 20.0;
+        let radius = spacing / std::f32::consts::PI.sqrt();
+        let center = |i: i32| (i as f32 + 0.5) * spacing - 1.0;
+        (0..400)
+            .map(|i| {
+                let position = [center(i % 20), center(i / 20), 0.0];
+                PointRecord::new(position, [0.0, 0.0, 1.0], radius, Sides { front, back }).unwrap()
+            })
+            .collect()
+    }
+
+    fn summed(points: &[PointRecord]) -> ClusterAccumulator {
+        let mut sum = ClusterAccumulator::default();
+        for point in points {
+            sum.add(point, &quantizer());
+        }
+        sum
+    }
+
+    #[test]
+    fn a_wall_is_flat_full_and_as_wide_as_its_voxel() {
+        let node = summed(&wall([1.0; 3], [0.0; 3]))
+            .finalize(Voxel::ROOT, &quantizer())
+            .attributes;
+        assert!(node.centroid.length() < 1e-6);
+        assert!(node.axis.distance(Vec3::Z) < 1e-6);
+        assert!(node.spread < 1e-3, "{}", node.spread);
+        assert!((node.fill - 1.0).abs() < 1e-3, "{}", node.fill);
+        // A uniform square of unit edge has variance 1/12 along both sides.
+        assert!((node.covariance[0] - 1.0 / 12.0).abs() < 1e-3);
+        assert!((node.covariance[1] - 1.0 / 12.0).abs() < 1e-3);
+        assert!(node.covariance[2].abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_sides_of_a_wall_are_told_apart() {
+        let node = summed(&wall([3.0, 2.0, 1.0], [0.0, 0.5, 1.0]))
+            .finalize(Voxel::ROOT, &quantizer())
+            .attributes;
+        let power = |d: Vec3| -> Vec3 {
+            let y = basis(d);
+            (0..SH_TERMS)
+                .map(|i| Vec3::new(node.sh[i][1].to_f32(), node.sh[i][2].to_f32(), node.sh[i][3].to_f32()) * y[i])
+                .sum()
+        };
+        let area = 4.0 / area_normaliser(2.0);
+        let (front, back) = separate_sides(power(Vec3::Z), power(-Vec3::Z));
+        assert!(
+            (front / area).distance(Vec3::new(3.0, 2.0, 1.0)) < 0.01,
+            "{}",
+            front / area
+        );
+        assert!(
+            (back / area).distance(Vec3::new(0.0, 0.5, 1.0)) < 0.01,
+            "{}",
+            back / area
+        );
+    }
+
+    #[test]
+    fn a_parent_is_the_sum_of_its_children() {
+        let points = wall([1.0, 0.5, 0.25], [0.1; 3]);
+        let whole = summed(&points).finalize(Voxel::ROOT, &quantizer()).attributes;
+        let mut merged = summed(&points[..150]);
+        merged.merge(&summed(&points[150..]));
+        let merged = merged.finalize(Voxel::ROOT, &quantizer()).attributes;
+        assert!(merged.centroid.distance(whole.centroid) < 1e-6);
+        assert_eq!(merged.sh, whole.sh);
+    }
+
+    #[test]
+    fn a_round_cluster_has_spread() {
+        let points: Vec<_> = (0..1000)
+            .map(|i| {
+                let z = 1.0 - (2 * i + 1) as f32 / 1000.0;
+                let phi = i as f32 * 2.399_963_2;
+                let n = [(1.0 - z * z).sqrt() * phi.cos(), (1.0 - z * z).sqrt() * phi.sin(), z];
+                PointRecord::new(n, n, 0.05, Sides::default()).unwrap()
+            })
+            .collect();
+        let node = summed(&points).finalize(Voxel::ROOT, &quantizer()).attributes;
+        assert!((node.spread - (2.0f32 / 3.0).sqrt()).abs() < 0.02, "{}", node.spread);
+    }
+
+    #[test]
+    fn plane_sections_have_their_known_areas() {
+        let center = DVec3::splat(0.5);
+        let diagonal = DVec3::ONE.normalize();
+        assert!((plane_section_area(center, DVec3::Z) - 1.0).abs() < 1e-12);
+        assert!((plane_section_area(center, DVec3::new(1.0, 1.0, 0.0).normalize()) - 2f64.sqrt()).abs() < 1e-12);
+        // The regular hexagon with edges of half a face diagonal.
+        assert!((plane_section_area(center, diagonal) - 1.299_038).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,185 @@
+//! The node: a voxel's cluster as it lies in files and pages, 112 bytes.
+
+use crate::ids::{NodeIndex, PointIndex};
+use crate::limits::MORTON_BITS;
+use crate::octahedral;
+use crate::sh::SH_TERMS;
+use bytemuck::{Pod, Zeroable};
+use glam::Vec3;
+use half::f16;
+
+/// One octree node with its cluster.
+///
+/// ```text
+/// byte 0          12      16     20       24       25     26     27      28           40                        112
+///      | centroid  | first | span | normal | level  |radius|spread| fill  | covariance | sh                     |
+///      | 3 x f32   | u32   | u32  | 2 x i16| + kind | code | code | code  | 6 x f16    | 9 x (area, r, g, b) f16|
+/// ```
+///
+/// Siblings are contiguous and never cross a page, so a first child and a mask replace the paper's eight indices; the room
+/// goes to the footprint (covariance, mean normal, spread, fill).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct NodeRecord {
+    /// Area-weighted mean position of the points, world space.
+    pub centroid: [f32; 3],
+    first: u32,
+    span: u32,
+    /// Axis that the discs face on average (octahedral): the principal axis of the area-weighted normals.
+    pub axis_code: [i16; 2],
+    level_and_kind: u8,
+    radius_code: u8,
+    spread_code: u8,
+    fill_code: u8,
+    /// Covariance of the covered surface over the square of the voxel's edge: xx, yy, zz, xy, xz, yz.
+    pub covariance: [f16; 6],
+    /// Spherical harmonics, per term: projected front area and power in R, G, B, each divided by
+    /// [`crate::pack::area_normaliser`] of the level.
+    pub sh: [[f16; 4]; SH_TERMS],
+}
+
+const _: () = assert!(size_of::<NodeRecord>() == 112);
+
+/// What lies below a node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NodeKind {
+    /// Children: the first one, and a bit for every octant that has one. They lie in octant order.
+    Inner {
+        /// First child.
+        first: NodeIndex,
+        /// Octants present; octant = z << 2 | y << 1 | x.
+        mask: u8,
+    },
+    /// Points.
+    Leaf {
+        /// First point.
+        first: PointIndex,
+        /// How many follow.
+        count: u32,
+    },
+    /// A leaf of the deepest level with more points than `leaf_max`: shaded as a cluster, never expanded.
+    Overflow {
+        /// First point.
+        first: PointIndex,
+        /// How many follow.
+        count: u32,
+    },
+}
+
+/// The cluster attributes of a node in plain numbers; [`NodeRecord::new`] packs them.
+#[derive(Clone, Copy, Debug)]
+pub struct NodeAttributes {
+    /// See [`NodeRecord::centroid`].
+    pub centroid: Vec3,
+    /// See [`NodeRecord::axis_code`].
+    pub axis: Vec3,
+    /// Largest point radius over the voxel's edge.
+    pub radius_ratio: f32,
+    /// See [`NodeRecord::spread`].
+    pub spread: f32,
+    /// See [`NodeRecord::fill`].
+    pub fill: f32,
+    /// See [`NodeRecord::covariance`].
+    pub covariance: [f32; 6],
+    /// See [`NodeRecord::sh`], already normalised.
+    pub sh: [[f16; 4]; SH_TERMS],
+}
+
+const LEVEL_MASK: u8 = 0x1f;
+const LEAF_BIT: u8 = 0x20;
+const OVERFLOW_BIT: u8 = 0x40;
+/// Radius codes are eighths of an octave around 2^-16 .. 2^16.
+const RADIUS_STEPS: f32 = 8.0;
+const RADIUS_ONE: f32 = 128.0;
+const FILL_STEPS: f32 = 64.0;
+
+impl NodeRecord {
+    /// Packs a node at `level`.
+    ///
+    /// # Panics
+    /// If `level` exceeds [`MORTON_BITS`]: a mistake of the caller.
+    pub fn new(level: u32, kind: NodeKind, attributes: &NodeAttributes) -> Self {
+        assert!(level <= MORTON_BITS, "level {level} does not fit the record");
+        let (first, span, bits) = match kind {
+            NodeKind::Inner { first, mask } => (first.0, u32::from(mask), 0),
+            NodeKind::Leaf { first, count } => (first.0, count, LEAF_BIT),
+            NodeKind::Overflow { first, count } => (first.0, count, LEAF_BIT | OVERFLOW_BIT),
+        };
+        let radius_code = (attributes.radius_ratio.log2() * RADIUS_STEPS + RADIUS_ONE)
+            .ceil()
+            .clamp(0.0, 255.0) as u8;
+        Self {
+            centroid: attributes.centroid.to_array(),
+            first,
+            span,
+            axis_code: octahedral::encode(attributes.axis),
+            level_and_kind: level as u8 | bits,
+            radius_code,
+            spread_code: (attributes.spread.clamp(0.0, 1.0) * 255.0).round() as u8,
+            fill_code: (attributes.fill * FILL_STEPS).round().clamp(0.0, 255.0) as u8,
+            covariance: attributes.covariance.map(f16::from_f32),
+            sh: attributes.sh,
+        }
+    }
+
+    /// Level of the voxel, 0 for the root.
+    #[inline]
+    pub fn level(&self) -> u32 {
+        u32::from(self.level_and_kind & LEVEL_MASK)
+    }
+
+    /// What lies below.
+    #[inline]
+    pub fn kind(&self) -> NodeKind {
+        if self.level_and_kind & LEAF_BIT == 0 {
+            NodeKind::Inner {
+                first: NodeIndex(self.first),
+                mask: self.span as u8,
+            }
+        } else if self.level_and_kind & OVERFLOW_BIT == 0 {
+            NodeKind::Leaf {
+                first: PointIndex(self.first),
+                count: self.span,
+            }
+        } else {
+            NodeKind::Overflow {
+                first: PointIndex(self.first),
+                count: self.span,
+            }
+        }
+    }
+
+    /// Replaces the first child of an inner node, when its children find their final place.
+    pub fn set_first_child(&mut self, first: NodeIndex) {
+        debug_assert!(self.level_and_kind & LEAF_BIT == 0, "a leaf has no children");
+        self.first = first.0;
+    }
+
+    /// Axis that the discs face on average, unit.
+    #[inline]
+    pub fn axis(&self) -> Vec3 {
+        octahedral::decode(self.axis_code)
+    }
+
+    /// Upper bound of the largest point radius over the voxel's edge: how far discs may stick out of the voxel.
+    #[inline]
+    pub fn radius_ratio(&self) -> f32 {
+        if self.radius_code == 0 {
+            0.0
+        } else {
+            ((f32::from(self.radius_code) - RADIUS_ONE) / RADIUS_STEPS).exp2()
+        }
+    }
+
+    /// Root mean square of the sine between the discs' normals and the axis: 0 for a flat cluster, 0.8 for a round one.
+    #[inline]
+    pub fn spread(&self) -> f32 {
+        f32::from(self.spread_code) / 255.0
+    }
+
+    /// Area of the discs over the area in which the cluster's plane cuts the voxel; 4 and more are 4, unknown is 0.
+    #[inline]
+    pub fn fill(&self) -> f32 {
+        f32::from(self.fill_code) / FILL_STEPS
+    }
+}

@@ -1,0 +1,131 @@
+//! The rows of the paper's Table 1, and ours beside them, under the names that the terminal, the job record, the EXR header
+//! and the statistics file share.
+
+use serde::{Deserialize, Serialize};
+
+macro_rules! statistics {
+    ($($(#[$doc:meta])* $name:ident: $unit:ident $label:literal,)*) => {
+        /// One flat record a command; `None` where a row does not apply.
+        #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct Statistics {
+            $($(#[$doc])* pub $name: Option<f64>,)*
+        }
+
+        impl Statistics {
+            /// Every row: name, label, unit, value. The order is the table's.
+            pub fn rows(&self) -> Vec<Row> {
+                vec![$(Row { name: stringify!($name), label: $label, unit: Unit::$unit, value: self.$name },)*]
+            }
+
+            /// Takes every row that `other` has.
+            pub fn update(&mut self, other: &Self) {
+                $(if other.$name.is_some() { self.$name = other.$name; })*
+            }
+
+            /// Sets a row by name; `false` if there is none of that name.
+            pub fn set(&mut self, name: &str, value: f64) -> bool {
+                match name {
+                    $(stringify!($name) => self.$name = Some(value),)*
+                    _ => return false,
+                }
+                true
+            }
+        }
+    };
+}
+
+/// One row of the table.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row {
+    /// Name in JSON and in records.
+    pub name: &'static str,
+    /// Name for people, the paper's where it has one.
+    pub label: &'static str,
+    /// Unit of the value.
+    pub unit: Unit,
+    /// The value.
+    pub value: Option<f64>,
+}
+
+/// Unit of a row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unit {
+    /// A plain number of things.
+    Count,
+    /// Seconds.
+    Seconds,
+    /// Bytes.
+    Bytes,
+    /// A share from 0 to 1.
+    Ratio,
+}
+
+statistics! {
+    /// Points of the scene.
+    points: Count "Point count",
+    /// Nodes of the scene.
+    nodes: Count "Node count",
+    /// Receivers shaded.
+    shading_calls: Count "Shading calls",
+    /// Wall time of reading, sorting and merging.
+    sort_seconds: Seconds "Point sort time",
+    /// Wall time of construction and writing.
+    build_seconds: Seconds "Octree build time",
+    /// Wall time of shading.
+    shading_seconds: Seconds "Shading time",
+    /// Processor time of shading, summed over workers.
+    shading_cpu_seconds: Seconds "Shading CPU time",
+    /// Time that workers waited for pages, summed.
+    shading_io_seconds: Seconds "Shading I/O time",
+    /// Bytes of the scene's pages.
+    out_of_core_bytes: Bytes "Out-of-core data",
+    /// Most bytes of pages resident at once.
+    cache_peak_bytes: Bytes "Cache peak RAM",
+    /// Segment and private memory of all processes at their peak.
+    peak_memory_bytes: Bytes "Peak memory",
+    /// Page requests served without the disk.
+    cache_hit_ratio: Ratio "Cache hit ratio",
+    /// Distinct bytes read over the scene's bytes.
+    cache_io_ratio: Ratio "Cache I/O ratio",
+    /// Loads of a page that was resident: always 0.
+    redundant_reads: Count "Redundant reads",
+    /// Pages evicted and read again.
+    reloads: Count "Reloads",
+    /// Clusters and points on the cut of a receiver.
+    average_cut_size: Count "Avg. cut size",
+    /// Nodes visited to find the cut.
+    average_nodes_traversed: Count "Avg. nodes traversed per cut",
+    /// Bytes of the pages that one receiver needs.
+    average_traversal_bytes: Bytes "Avg. traversal memory",
+    /// Pages read from disk.
+    pages_loaded: Count "Pages loaded",
+    /// Bytes read from disk.
+    bytes_read: Bytes "Bytes read",
+    /// Bytes written to disk.
+    bytes_written: Bytes "Bytes written",
+    /// Requests served by a worker's own cache.
+    local_hits: Count "Local hits",
+    /// Requests served by the shared cache.
+    shared_hits: Count "Shared hits",
+    /// Shared hits on pages that another job brought in.
+    shared_hits_other_job: Count "Shared hits, other job's pages",
+    /// Requests that went to the disk.
+    cache_misses: Count "Cache misses",
+    /// Pixels without a receiver.
+    holes: Count "Holes",
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_are_set_and_read_by_name() {
+        let mut statistics = Statistics::default();
+        assert!(statistics.set("points", 5.0));
+        assert!(!statistics.set("surfels", 5.0));
+        assert_eq!(statistics.points, Some(5.0));
+        assert_eq!(statistics.rows().len(), 26);
+    }
+}
