@@ -6,6 +6,7 @@
 
 pub mod bounds;
 pub mod cluster;
+pub mod environment;
 pub mod ids;
 pub mod limits;
 pub mod morton;
@@ -22,6 +23,7 @@ pub mod voxel;
 
 pub use bounds::Bounds;
 pub use cluster::ClusterAccumulator;
+pub use environment::Environment;
 pub use ids::{BuildId, MountId, NodeIndex, PageKey, PageKind, PageNo, PointIndex};
 pub use morton::{MortonCode, Quantizer};
 pub use node::{NodeKind, NodeRecord};
