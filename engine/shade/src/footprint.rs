@@ -11,6 +11,10 @@ use glam::Vec3;
 const HALF_SPACES_MAX: usize = 8;
 /// Apothem of an octagon over the radius of the disc of equal area.
 const OCTAGON_APOTHEM: f32 = 0.973_68;
+/// Cosine between a plane's normal and an axis from which the plane counts as running along the faces across that axis.
+const ALONG_FACE: f32 = 0.9;
+/// How far such a plane may lie outside the voxel, as a share of its half edge.
+const FACE_SLACK: f32 = 0.05;
 
 /// The half-space `x d.x + y d.y + z d.z >= 0` in the receiver's frame.
 #[derive(Clone, Copy, Debug, Default)]
@@ -128,6 +132,12 @@ impl Footprint {
         let normal = frame.local_from_world(plane.normal);
         let mut footprint = Self::empty(frame.local_from_world(center), half * 1.732_051);
         for (axis, middle) in [(Vec3::X, center.x), (Vec3::Y, center.y), (Vec3::Z, center.z)] {
+            // A plane along a face of the voxel must not fall out of it by rounding.
+            let half = if axis.dot(plane.normal).abs() > ALONG_FACE {
+                half * (1.0 + FACE_SLACK)
+            } else {
+                half
+            };
             let axis = frame.local_from_world(axis);
             footprint.add_slab(normal, plane.distance, axis, middle - half, middle + half);
         }
