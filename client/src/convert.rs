@@ -1,7 +1,8 @@
 //! Wire types to plain types and back.
 
-use crate::job::{BuildJob, DaemonStatus, Density, Job, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
+use crate::job::{BuildJob, DaemonStatus, Job, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
 use pbgi_core::{Bounds, BuildId, BuildSettings, NodeIndex, Quantizer, SceneInfo, ShadeSettings, Statistics};
+use pbgi_points::Density;
 use pbgi_proto::v1;
 use std::path::Path;
 

@@ -1,6 +1,7 @@
 //! Jobs and daemon in plain types.
 
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
+use pbgi_points::Density;
 use std::path::PathBuf;
 
 /// Points or meshes in, a scene directory out.
@@ -16,15 +17,6 @@ pub struct BuildJob {
     pub settings: BuildSettings,
     /// How densely meshes are sampled; `None` for the default.
     pub density: Option<Density>,
-}
-
-/// How densely a mesh is sampled.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Density {
-    /// Distance between points, world units.
-    Spacing(f32),
-    /// Number of points.
-    Points(u64),
 }
 
 /// A scene and a G-buffer in, an image out.

@@ -154,7 +154,9 @@ impl Folders {
             match seat.start().await {
                 Ok(pid) => {
                     let client = Client::connect_path(&seat.socket()).await?;
-                    say(&format!("started a private daemon (pid {pid}); it exits when it has been idle"));
+                    say(&format!(
+                        "started a private daemon (pid {pid}); it exits when it has been idle"
+                    ));
                     return Ok(client);
                 }
                 Err(ClientError::Start(_)) if attempt < ATTEMPTS && seat.is_leaving() => {
@@ -301,7 +303,11 @@ impl<'a> Seat<'a> {
             command.arg("--workers").arg(workers.to_string());
         }
         // It outlives this command: it must hold neither the terminal nor a pipe of ours, nor the folder we stand in.
-        command.current_dir("/").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(log);
+        command
+            .current_dir("/")
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(log);
         command.spawn().map_err(|source| ClientError::Io {
             action: "run",
             path: self.program.to_owned(),
@@ -345,7 +351,11 @@ fn key(program: &Path, options: &PrivateOptions) -> Result<String, ClientError> 
         metadata.mtime_nsec()
     );
     let limits = format!("{:?} {:?}", options.memory_bytes, options.workers);
-    let hash = fnv([program.as_os_str().as_encoded_bytes(), build.as_bytes(), limits.as_bytes()]);
+    let hash = fnv([
+        program.as_os_str().as_encoded_bytes(),
+        build.as_bytes(),
+        limits.as_bytes(),
+    ]);
     Ok(format!("{hash:016x}"))
 }
 
@@ -353,9 +363,9 @@ fn key(program: &Path, options: &PrivateOptions) -> Result<String, ClientError> 
 fn fnv<const N: usize>(parts: [&[u8]; N]) -> u64 {
     let step = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
     let offset = 0xcbf2_9ce4_8422_2325;
-    parts
-        .iter()
-        .fold(offset, |hash, part| step(part.iter().fold(hash, |h, &byte| step(h, byte)), 0xff))
+    parts.iter().fold(offset, |hash, part| {
+        step(part.iter().fold(hash, |h, &byte| step(h, byte)), 0xff)
+    })
 }
 
 /// Bytes that follow the runtime folder in the longest socket path.
@@ -403,7 +413,12 @@ mod tests {
 
     #[test]
     fn folders_follow_the_xdg_variables() {
-        let found = folders(&[("HOME", "/home/a"), ("XDG_RUNTIME_DIR", "/run/user/7"), ("XDG_CACHE_HOME", "/c")]).unwrap();
+        let found = folders(&[
+            ("HOME", "/home/a"),
+            ("XDG_RUNTIME_DIR", "/run/user/7"),
+            ("XDG_CACHE_HOME", "/c"),
+        ])
+        .unwrap();
         assert_eq!(found.runtime, PathBuf::from("/run/user/7/pbgi"));
         assert_eq!(found.state, PathBuf::from("/home/a/.local/state/pbgi"));
         assert_eq!(found.cache, PathBuf::from("/c/pbgi"));
@@ -459,7 +474,12 @@ mod tests {
         make_private(&folder).unwrap();
         assert_eq!(fs::metadata(&folder).unwrap().permissions().mode() & 0o777, 0o700);
         fs::set_permissions(&folder, fs::Permissions::from_mode(0o777)).unwrap();
-        assert!(make_private(&folder).unwrap_err().to_string().contains("PBGI_RUNTIME_DIR"));
+        assert!(
+            make_private(&folder)
+                .unwrap_err()
+                .to_string()
+                .contains("PBGI_RUNTIME_DIR")
+        );
     }
 
     fn script(folder: &Path, body: &str) -> PathBuf {
@@ -494,7 +514,9 @@ mod tests {
 
     #[test]
     fn a_missing_program_is_named() {
-        let text = server_program(Path::new("/nonexistent/pbgi-client")).unwrap_err().to_string();
+        let text = server_program(Path::new("/nonexistent/pbgi-client"))
+            .unwrap_err()
+            .to_string();
         assert!(text.contains("/nonexistent/pbgi-server"), "{text}");
     }
 }

@@ -73,7 +73,20 @@ mod tests {
 
     #[test]
     fn nonsense_is_no_size() {
-        for text in ["", "G", "two", "-1G", "1..5G", "1e3", "NaN", "inf", "0", "0.0001", "99999999T", "2 G G"] {
+        for text in [
+            "",
+            "G",
+            "two",
+            "-1G",
+            "1..5G",
+            "1e3",
+            "NaN",
+            "inf",
+            "0",
+            "0.0001",
+            "99999999T",
+            "2 G G",
+        ] {
             assert!(parse_bytes(text).is_err(), "{text}");
         }
     }
