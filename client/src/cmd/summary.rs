@@ -22,18 +22,14 @@ pub(crate) fn report(statistics: &Statistics, file: Option<&Path>) -> Result<(),
 
 /// Rows that have a value: name, value, unit, and the name for people.
 pub(crate) fn table(statistics: &Statistics) -> String {
-    let rows: Vec<_> = statistics
-        .rows()
+    let rows = statistics.rows();
+    let figures = rows.iter().filter_map(|row| Some((row, figure(row.unit, row.value?))));
+    let figures: Vec<_> = figures.collect();
+    let names = figures.iter().map(|(row, _)| row.name.len()).max().unwrap_or(0);
+    let values = figures.iter().map(|(_, (value, _))| value.len()).max().unwrap_or(0);
+    figures
         .iter()
-        .filter_map(|row| row.value.map(|value| (row.name, figure(row.unit, value), row.label)))
-        .collect();
-    let width = |column: fn(&(&'static str, (String, &'static str), &'static str)) -> usize| {
-        rows.iter().map(column).max().unwrap_or(0)
-    };
-    let names = width(|row| row.0.len());
-    let values = width(|row| row.1.0.len());
-    rows.iter()
-        .map(|(name, (value, unit), label)| format!("{name:<names$}  {value:>values$} {unit:<3}  {label}\n"))
+        .map(|(row, (value, unit))| format!("{:names$}  {value:>values$} {unit:<3}  {}\n", row.name, row.label))
         .collect()
 }
 
@@ -78,7 +74,7 @@ pub(crate) fn grouped(value: u64) -> String {
     let digits = value.to_string();
     let mut text = String::new();
     for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index) % 3 == 0 {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
             text.push(',');
         }
         text.push(digit);
