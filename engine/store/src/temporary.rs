@@ -120,7 +120,7 @@ fn settle(volume: &dyn Volume, temporary: &Path, target: &Path, mode: RenameMode
     volume.sync_dir(parent(target)).map_err(|error| {
         // If this fails too, a complete and checked result stays visible, which is the lesser evil.
         let _ = volume.rename(target, temporary, mode);
-        StoreError::io("sync folder", parent(target), error)
+        write_error(volume, "sync folder", parent(target), 0, error)
     })
 }
 
