@@ -17,7 +17,9 @@ pub fn program(name: &str) -> PathBuf {
         let test = std::env::current_exe().unwrap();
         let folder = test.parent().unwrap().parent().unwrap().to_path_buf();
         let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-        cargo.current_dir(workspace_root()).args(["build", "--workspace", "--bins", "--locked", "--quiet"]);
+        cargo
+            .current_dir(workspace_root())
+            .args(["build", "--workspace", "--bins", "--locked", "--quiet"]);
         if !cfg!(debug_assertions) {
             cargo.arg("--release");
         }
@@ -97,7 +99,9 @@ impl House {
                 command.env(variable, value);
             }
         }
-        command.env("HOME", self.path("home")).env("PBGI_RUNTIME_DIR", self.path("run"));
+        command
+            .env("HOME", self.path("home"))
+            .env("PBGI_RUNTIME_DIR", self.path("run"));
         for variable in ["XDG_STATE_HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"] {
             command.env(variable, self.path("home").join(variable));
         }
@@ -120,7 +124,9 @@ impl House {
         let own = i32::try_from(std::process::id()).unwrap();
         let mut found = vec![];
         for entry in std::fs::read_dir("/proc").unwrap().flatten() {
-            let Ok(pid) = entry.file_name().to_string_lossy().parse::<i32>() else { continue };
+            let Ok(pid) = entry.file_name().to_string_lossy().parse::<i32>() else {
+                continue;
+            };
             let text = |file: &str| {
                 let bytes = std::fs::read(entry.path().join(file)).unwrap_or_default();
                 String::from_utf8_lossy(&bytes).replace('\0', " ")

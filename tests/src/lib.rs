@@ -3,7 +3,12 @@
 //!
 //! Start at [`House`]. Nothing here reaches into the daemon: what a test sees is what a user sees.
 #![forbid(unsafe_code)]
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a harness fails by panicking")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "a harness fails by panicking"
+)]
 
 mod house;
 mod picture;

@@ -18,24 +18,43 @@ pub struct Picture {
 impl Picture {
     /// Reads a file.
     pub fn read(path: &Path) -> Self {
-        let image = read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer().all_attributes();
-        let image = image.from_file(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        let image = read()
+            .no_deep_data()
+            .largest_resolution_level()
+            .all_channels()
+            .first_valid_layer()
+            .all_attributes();
+        let image = image
+            .from_file(path)
+            .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         let layer = image.layer_data;
         let list = layer.channel_data.list;
         let channels = list.into_iter().map(|channel| {
-            (channel.name.to_string(), channel.sample_data.values_as_f32().collect::<Vec<_>>())
+            (
+                channel.name.to_string(),
+                channel.sample_data.values_as_f32().collect::<Vec<_>>(),
+            )
         });
         let mut channels: BTreeMap<_, _> = channels.collect();
         // A layer's name is the prefix of all its channels.
         if let Some(name) = layer.attributes.layer_name {
-            channels = channels.into_iter().map(|(channel, values)| (format!("{name}.{channel}"), values)).collect();
+            channels = channels
+                .into_iter()
+                .map(|(channel, values)| (format!("{name}.{channel}"), values))
+                .collect();
         }
-        Self { width: layer.size.0, height: layer.size.1, channels }
+        Self {
+            width: layer.size.0,
+            height: layer.size.1,
+            channels,
+        }
     }
 
     /// A channel that must be there.
     pub fn channel(&self, name: &str) -> &[f32] {
-        self.channels.get(name).unwrap_or_else(|| panic!("no channel {name} among {:?}", self.channels.keys()))
+        self.channels
+            .get(name)
+            .unwrap_or_else(|| panic!("no channel {name} among {:?}", self.channels.keys()))
     }
 }
 

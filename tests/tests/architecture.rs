@@ -13,7 +13,17 @@ const ARROWS: [(&str, &[&str]); 11] = [
     ("pbgi-shade", &["pbgi-core"]),
     ("pbgi-points", &["pbgi-core", "pbgi-store"]),
     ("pbgi-build", &["pbgi-core", "pbgi-store"]),
-    ("pbgi-server", &["pbgi-build", "pbgi-cache", "pbgi-core", "pbgi-points", "pbgi-proto", "pbgi-store"]),
+    (
+        "pbgi-server",
+        &[
+            "pbgi-build",
+            "pbgi-cache",
+            "pbgi-core",
+            "pbgi-points",
+            "pbgi-proto",
+            "pbgi-store",
+        ],
+    ),
     ("pbgi-worker", &["pbgi-cache", "pbgi-core", "pbgi-proto", "pbgi-shade"]),
     ("pbgi-client", &["pbgi-core", "pbgi-points", "pbgi-proto"]),
     ("pbgi-tests", ANYTHING),
@@ -39,9 +49,15 @@ const CARD: [(&str, &str); 11] = [
 
 fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
     let metadata = cargo_metadata::MetadataCommand::new().no_deps().exec().unwrap();
-    let normal = |dependency: &&cargo_metadata::Dependency| dependency.kind != cargo_metadata::DependencyKind::Development;
+    let normal =
+        |dependency: &&cargo_metadata::Dependency| dependency.kind != cargo_metadata::DependencyKind::Development;
     let names = |package: &cargo_metadata::Package| {
-        let names = package.dependencies.iter().filter(normal).map(|dependency| dependency.name.clone()).collect();
+        let names = package
+            .dependencies
+            .iter()
+            .filter(normal)
+            .map(|dependency| dependency.name.clone())
+            .collect();
         (package.name.to_string(), names)
     };
     metadata.packages.iter().map(names).collect()
@@ -50,7 +66,10 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
 #[test]
 fn crates_depend_only_along_the_arrows() {
     let actual = dependencies();
-    assert_eq!(actual.keys().map(String::as_str).collect::<BTreeSet<_>>(), ARROWS.map(|(name, _)| name).into());
+    assert_eq!(
+        actual.keys().map(String::as_str).collect::<BTreeSet<_>>(),
+        ARROWS.map(|(name, _)| name).into()
+    );
     for (name, allowed) in ARROWS {
         for dependency in actual[name].iter().filter(|dependency| dependency.starts_with("pbgi-")) {
             let fits = allowed == ANYTHING || allowed.contains(&dependency.as_str());
