@@ -27,13 +27,20 @@ const SECTION_FILL: f32 = 0.7;
 /// Above this the voxel holds two sheets, of which the receiver sees one.
 const TWO_SHEETS_FILL: f32 = 1.6;
 /// Share of the accepted solid angle at which clusters without a plane are accepted: their silhouette is a guess.
-const ROUND_SHARE: f32 = 0.25;
+const ROUND_SHARE: f32 = 0.1;
 /// Discs are drawn this much wider than their area says, because round ones of equal area leave gaps on a surface.
-const DISC_SCALE: f32 = 1.2;
+const DISC_SCALE: f32 = 1.4;
 /// Cosine between normals from which a disc is taken for the receiver's own surface.
 const SAME_SURFACE: f32 = 0.7;
+/// How far from an arc through both a receiver and an element may stand, as a sine.
+const ARC_SLACK: f32 = 0.15;
+/// The same where the normals are opposed: a sheet seen from its back, or another surface close by.
+const ARC_SLACK_OPPOSED: f32 = 0.03;
+/// Distance in voxel edges, and in radii of a disc, within which an element may be the receiver's own surface.
+const NEAR_VOXELS: f32 = 2.5;
+const NEAR_RADII: f32 = 6.0;
 /// Share of covered bits from which it pays to ask whether a voxel is hidden.
-const HIDDEN_TEST_SHARE: f32 = 0.25;
+const HIDDEN_TEST_SHARE: f32 = 0.1;
 /// Octants by distance from the nearest, as differences in bits.
 const NEAR_TO_FAR: [u32; 8] = [0, 1, 2, 4, 3, 5, 6, 7];
 
@@ -248,8 +255,11 @@ impl Cluster {
         let across = quadratic_form(&covariance, axis).max(0.0).sqrt();
         let flat = node.spread() < FLAT_SPREAD && across < FLAT_THICKNESS * edge;
         let inside = visit.center.abs().max_element() <= visit.half * 1.01;
-        let own_surface =
-            inside && flat && axis.dot(receiver.normal).abs() > SAME_SURFACE && axis.dot(centroid).abs() < 0.25 * edge;
+        let near = centroid.length_squared() < NEAR_VOXELS * NEAR_VOXELS * edge * edge;
+        let own_surface = flat
+            && near
+            && (continues_surface(receiver.normal, axis, centroid)
+                || (inside && is_aligned(receiver.normal, axis) && axis.dot(centroid).abs() < 0.08 * edge));
         Self {
             centroid,
             distance_squared: centroid.length_squared(),
@@ -294,6 +304,28 @@ impl Cluster {
         }
         (even, odd)
     }
+}
+
+#[inline(always)]
+fn is_aligned(a: Vec3, b: Vec3) -> bool {
+    a.dot(b).abs() > SAME_SURFACE
+}
+
+/// Whether an element at `center` with `normal` is the receiver's own surface curving away, which only the flatness of the
+/// element lifts above the receiver: the receiver is behind it, and both normals stand on one arc. On a circle the chord
+/// makes equal and opposite angles with the normals at its ends.
+#[inline(always)]
+fn continues_surface(receiver_normal: Vec3, normal: Vec3, center: Vec3) -> bool {
+    let facing = normal.dot(receiver_normal);
+    let (normal, slack) = if facing < 0.0 {
+        (-normal, ARC_SLACK_OPPOSED)
+    } else {
+        (normal, ARC_SLACK)
+    };
+    let behind = normal.dot(center);
+    facing.abs() > SAME_SURFACE
+        && behind >= 0.0
+        && (behind + receiver_normal.dot(center)).abs() < slack * center.length()
 }
 
 #[inline(always)]
@@ -443,7 +475,7 @@ impl Painter<'_> {
         if share < OPAQUE_SHARE {
             density = share / OPAQUE_SHARE;
         }
-        let scale = share.clamp(OPAQUE_SHARE, 1.0).sqrt();
+        let scale = (share.clamp(OPAQUE_SHARE, 1.0) * ROUND_SCALE).sqrt();
         a *= scale;
         b *= scale;
         let local = |v| self.frame.local_from_world(v);
@@ -463,10 +495,12 @@ impl Painter<'_> {
         let normal = point.normal();
         let plane = Plane::through(center, normal);
         let distance = center.length();
-        let near = distance < 4.0 * point.radius;
-        let same = normal.dot(receiver.normal).abs() > SAME_SURFACE;
-        if near && same && plane.distance < self.walk.settings.bias * point.radius {
-            return;
+        if distance < NEAR_RADII * point.radius {
+            let touched =
+                is_aligned(receiver.normal, normal) && plane.distance < self.walk.settings.bias * point.radius;
+            if touched || continues_surface(receiver.normal, normal, center) {
+                return;
+            }
         }
         let footprint = Footprint::disc(self.frame, center, plane, point.radius * DISC_SCALE);
         let weight = self.weight(distance, point.radius);
@@ -508,3 +542,6 @@ impl Painter<'_> {
 
 /// Share of its rectangle that a round cluster must show to be drawn opaque; thinner ones are drawn with holes.
 const OPAQUE_SHARE: f32 = 0.4;
+/// Area by which an opaque round cluster is drawn larger: a rectangle never meets its neighbours exactly, and a closed wall
+/// must not leak.
+const ROUND_SCALE: f32 = 1.2;

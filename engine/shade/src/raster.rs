@@ -228,6 +228,9 @@ fn footprint_masks(tables: &RasterTables, footprint: &Footprint, block: usize) -
 /// polynomial 4.4.45 of Abramowitz and Stegun, whose error (7e-5) is a thousandth of a column.
 #[inline(always)]
 fn columns(tangent: &[f32; LANES], resolution: usize) -> [u32; LANES] {
+    /// 2^23: floats from here on are integers.
+    const INTEGER_SHIFT: f32 = 8_388_608.0;
+    const COLUMN_MASK: u32 = 0x7f;
     let resolution = resolution as f32;
     let mut result = [0; LANES];
     for lane in 0..LANES {
@@ -238,7 +241,8 @@ fn columns(tangent: &[f32; LANES], resolution: usize) -> [u32; LANES] {
         let arcsine = PI / 2.0 - (1.0 - sin).sqrt() * polynomial;
         let half_share = (arcsine + sin * cos) * FRAC_1_PI;
         let share = 0.5 + half_share.copysign(u);
-        result[lane] = (share * resolution + 0.5).clamp(0.0, resolution) as u32;
+        // The sum's last bits are the rounded integer; a cast would check for what cannot be.
+        result[lane] = (share * resolution + INTEGER_SHIFT).to_bits() & COLUMN_MASK;
     }
     result
 }

@@ -106,6 +106,11 @@ impl Shader {
         })
     }
 
+    /// Keeps to the instructions that every processor has, to compare with or to rule out; the results are the same.
+    pub fn use_scalar(&mut self) {
+        self.simd = Simd::Scalar;
+    }
+
     /// Shades a group of neighbouring receivers. The results depend on the scene, the settings and the receivers alone.
     ///
     /// # Errors

@@ -1,5 +1,7 @@
 //! Scenes whose irradiance and occlusion are known in closed form.
 
+#![allow(clippy::unwrap_used, reason = "tests")]
+
 mod support;
 
 use glam::Vec3;
@@ -51,7 +53,7 @@ fn room(count: usize, radiance: f32) -> Vec<PointRecord> {
 
 #[test]
 fn a_closed_room_of_constant_radiance_gives_pi_l_and_no_opening() {
-    for count in [50, 100, 300] {
+    for (count, tolerance) in [(50, 0.03), (100, 0.025), (300, 0.015)] {
         let receivers = [
             up(0.0, -1.0, 0.0),
             up(0.9, -1.0, 0.9),
@@ -68,9 +70,12 @@ fn a_closed_room_of_constant_radiance_gives_pi_l_and_no_opening() {
         ];
         for (receiver, result) in receivers.iter().zip(shade(&room(count, 2.0), &receivers)) {
             let e = result.irradiance[0];
-            assert!((e / (2.0 * PI) - 1.0).abs() < 0.02, "{count}: {receiver:?}: {result:?}");
             assert!(
-                (result.occlusion - 1.0).abs() < 0.02,
+                (e / (2.0 * PI) - 1.0).abs() < tolerance,
+                "{count}: {receiver:?}: {result:?}"
+            );
+            assert!(
+                (result.occlusion - 1.0).abs() < tolerance,
                 "{count}: {receiver:?}: {result:?}"
             );
         }

@@ -2,6 +2,8 @@
 
 #![allow(dead_code, unreachable_pub, reason = "each test file uses its part")]
 
+pub mod truth;
+
 use glam::Vec3;
 use pbgi_core::point::Sides;
 use pbgi_core::{
