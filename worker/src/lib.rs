@@ -16,6 +16,7 @@ mod tile_loop;
 
 pub use attach::die_with_parent;
 pub use error::WorkerError;
+pub use shading::FailureKind;
 
 use std::path::PathBuf;
 use tracing_subscriber::EnvFilter;
@@ -28,6 +29,9 @@ use tracing_subscriber::EnvFilter;
     about = "Shades tiles for pbgi-server, which starts it; nothing for people"
 )]
 pub struct Options {
+    /// Descriptor of the page channel: 0, standard input
+    #[arg(long, value_name = "FD", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=0))]
+    pub page_channel: u32,
     /// The daemon's queue socket
     #[arg(long, value_name = "SOCKET")]
     pub queue: PathBuf,

@@ -43,7 +43,9 @@ impl Queue {
             .connect_with_connector(connector)
             .await
             .map_err(|error| unreachable(error.to_string()))?;
-        let token = token.parse().map_err(|_| WorkerError::Defect("a token that is no text".to_owned()))?;
+        let token = token
+            .parse()
+            .map_err(|_| WorkerError::Defect("a token that is no text".to_owned()))?;
         let client = QueueServiceClient::new(channel)
             .max_decoding_message_size(MESSAGE_BYTES_MAX)
             .max_encoding_message_size(MESSAGE_BYTES_MAX);

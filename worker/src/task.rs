@@ -64,7 +64,10 @@ fn scene_info(wire: &v1::SceneInfo) -> Result<SceneInfo, String> {
     settings.validate().map_err(|error| error.to_string())?;
     let records_max = 1 << 32;
     if wire.point_count > records_max || wire.node_slots > records_max {
-        return Err(format!("{} points and {} node slots", wire.point_count, wire.node_slots));
+        return Err(format!(
+            "{} points and {} node slots",
+            wire.point_count, wire.node_slots
+        ));
     }
     Ok(SceneInfo {
         build_id,

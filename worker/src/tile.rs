@@ -23,7 +23,8 @@ impl Tile {
         if !lease.receivers.len().is_multiple_of(size_of::<Receiver>()) {
             return Err(format!("a tile of {} bytes", lease.receivers.len()));
         }
-        let receivers: Vec<Receiver> = bytemuck::pod_collect_to_vec(&lease.receivers);
+        let records = lease.receivers.chunks_exact(size_of::<Receiver>());
+        let receivers: Vec<Receiver> = records.map(bytemuck::pod_read_unaligned).collect();
         let mut groups = Vec::with_capacity(lease.group_lengths.len());
         let mut start = 0;
         for &length in &lease.group_lengths {

@@ -71,7 +71,9 @@ async fn shade(
     };
     let died = |_| WorkerError::Defect("the shading thread is gone".to_owned());
     // Never blocks: the thread has answered the last order before this one is made.
-    shader.send(order).map_err(|_| WorkerError::Defect("the shading thread is gone".to_owned()))?;
+    shader
+        .send(order)
+        .map_err(|_| WorkerError::Defect("the shading thread is gone".to_owned()))?;
     let mut beat = tokio::time::interval(HEARTBEAT);
     beat.tick().await;
     loop {
