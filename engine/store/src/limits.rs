@@ -1,0 +1,40 @@
+//! Bounds and tuned constants of files on disk.
+
+use std::time::Duration;
+
+/// Records in one file: every index fits a `u32`, and so does the index behind the last record.
+pub const RECORDS_MAX: u64 = u32::MAX as u64;
+
+/// Bytes in front of the first page: one sector of any disk, so that pages stay aligned.
+pub const HEADER_BYTES: usize = 4096;
+
+/// Bytes of a checksum in the table behind the last page.
+pub const CHECKSUM_BYTES: u64 = 4;
+
+/// Bytes a page file gathers before it writes, unless one page is larger.
+pub const WRITE_BUFFER_BYTES: usize = 1 << 20;
+
+/// Records in a block of a run: 256 KiB, large enough to read at the speed of the disk, small enough that 64 MB merge 190
+/// runs at once.
+pub const RUN_BLOCK_RECORDS: usize = 8192;
+
+/// Longest manifest read: a real one has about 1 KiB.
+pub const MANIFEST_BYTES_MAX: u64 = 64 << 10;
+
+/// How often a read that failed with EIO, EINTR or ESTALE is tried.
+pub const READ_ATTEMPTS: u32 = 3;
+
+/// Pause before the second try of a read; the third waits ten times as long.
+pub const READ_BACKOFF: Duration = Duration::from_millis(1);
+
+/// How often an operation that lost a race with another process is tried.
+pub const RACE_ATTEMPTS: u32 = 16;
+
+/// Permissions of files: the group may read.
+pub const FILE_MODE: u32 = 0o640;
+
+/// Permissions of a scene's folder.
+pub const SCENE_MODE: u32 = 0o750;
+
+/// Permissions of scratch folders.
+pub const SCRATCH_MODE: u32 = 0o700;

@@ -1,0 +1,7 @@
+//! The promises of the store, kept on real files and on disks that fail and crash.
+
+mod crash;
+mod fault;
+mod leftovers;
+mod scene;
+mod support;
