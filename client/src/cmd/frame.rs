@@ -15,24 +15,10 @@ const ASPECT_RANGE: std::ops::RangeInclusive<f32> = 0.1..=10.0;
 /// Renders the G-buffer of a mesh file; blocks.
 pub(crate) fn render(scene: &Path, args: CameraArgs) -> Result<GBuffer, Failure> {
     let mesh = MeshScene::load(scene)?;
-    let camera = camera(&mesh, scene, args.camera)?;
+    let camera = mesh.camera(args.camera.unwrap_or(0));
+    let camera = camera.map_err(|error| Failure::usage(format!("{error}: {}", scene.display())))?;
     let size = args.size.unwrap_or_else(|| size_for(&camera));
     Ok(GBuffer::render(&mesh, &camera, size.width, size.height)?)
-}
-
-fn camera(mesh: &MeshScene, scene: &Path, wanted: Option<usize>) -> Result<Camera, Failure> {
-    let cameras = mesh.cameras();
-    match (cameras.get(wanted.unwrap_or(0)), wanted) {
-        (Some(camera), _) => Ok(camera.clone()),
-        (None, None) => Ok(Camera::framing(&mesh.bounds())),
-        (None, Some(_)) if cameras.is_empty() => Err(Failure::usage(format!(
-            "{scene:?} has no cameras; leave out --camera to see it from its front"
-        ))),
-        (None, Some(index)) => Err(Failure::usage(format!(
-            "{scene:?} has no camera {index}, its cameras are 0 to {}",
-            cameras.len() - 1
-        ))),
-    }
 }
 
 fn size_for(camera: &Camera) -> Size {

@@ -8,8 +8,9 @@ use super::interrupt::Interrupt;
 use super::progress::Progress;
 use super::summary;
 use clap::Args;
-use pbgi_core::{Bounds, PointRecord, PointStream, Statistics};
-use pbgi_points::{BoxedPointStream, PointsError, SampleOptions, open_input, write_point_ply};
+use pbgi_core::Statistics;
+use pbgi_points::{PointsError, SampleOptions, open_input, write_point_ply};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 const SAMPLE_EXAMPLES: &str = "\
@@ -40,8 +41,8 @@ pub(crate) async fn sample(args: SampleArgs, interrupt: &Interrupt) -> Result<()
     let mut options = SampleOptions::default();
     options.density = args.density.density().unwrap_or(options.density);
     let aside = interrupt.clone();
-    // Not given up on a signal: the stream sees it, so that the half-written file is removed.
-    let written = tokio::task::spawn_blocking(move || write_points(&inputs, &output, &options, aside)).await;
+    // Not given up on a signal: the writer sees it, and removes the half-written file.
+    let written = tokio::task::spawn_blocking(move || write_points(&inputs, &output, &options, &aside)).await;
     let statistics = written.unwrap_or_else(|error| Err(Failure::failed(format!("defect: {error}"))))?;
     eprintln!("wrote {}", args.output.output.display());
     summary::report(&statistics, args.stats.stats.as_deref())
@@ -51,65 +52,29 @@ fn write_points(
     inputs: &[PathBuf],
     output: &Path,
     options: &SampleOptions,
-    interrupt: Interrupt,
+    interrupt: &Interrupt,
 ) -> Result<Statistics, Failure> {
     let mut progress = Progress::new();
     progress.stage("loading");
-    let inner = open_input(inputs, options)?;
-    let mut stream = Observed {
-        total: inner.len_hint().unwrap_or(0),
-        inner,
-        progress,
-        interrupt,
-        count: 0,
+    let mut stream = open_input(inputs, options)?;
+    let total = stream.len_hint().unwrap_or(0);
+    let mut observer = |count| {
+        progress.show("sampling", count, total);
+        match interrupt.asked() {
+            true => ControlFlow::Break(()),
+            false => ControlFlow::Continue(()),
+        }
     };
-    write_point_ply(output, &mut stream).map_err(|error| match stream.interrupt.asked() {
-        true => Failure::Interrupted("nothing was written".to_owned()),
-        false => Failure::from(error),
-    })?;
+    let points = match write_point_ply(output, &mut *stream, &mut observer) {
+        Err(PointsError::Cancelled) => return Err(Failure::Interrupted("nothing was written".to_owned())),
+        written => written?,
+    };
     let bytes = std::fs::metadata(output).map_or(0, |metadata| metadata.len());
     Ok(Statistics {
-        points: Some(stream.count as f64),
+        points: Some(points as f64),
         bytes_written: Some(bytes as f64),
         ..Default::default()
     })
-}
-
-/// A stream whose progress is shown and that ends when the user interrupts.
-struct Observed {
-    inner: BoxedPointStream,
-    progress: Progress,
-    interrupt: Interrupt,
-    count: u64,
-    total: u64,
-}
-
-impl PointStream for Observed {
-    type Error = PointsError;
-
-    fn bounds(&self) -> Option<Bounds> {
-        self.inner.bounds()
-    }
-
-    fn len_hint(&self) -> Option<u64> {
-        self.inner.len_hint()
-    }
-
-    fn next_batch(&mut self, batch: &mut Vec<PointRecord>) -> Result<bool, PointsError> {
-        if self.interrupt.asked() {
-            return Err(PointsError::Request("interrupted".to_owned()));
-        }
-        let before = batch.len();
-        let more = self.inner.next_batch(batch)?;
-        self.count += (batch.len() - before) as u64;
-        self.progress.show("sampling", self.count, self.total);
-        Ok(more)
-    }
-
-    fn rewind(&mut self) -> Result<(), PointsError> {
-        self.count = 0;
-        self.inner.rewind()
-    }
 }
 
 const GBUFFER_EXAMPLES: &str = "\
