@@ -43,14 +43,15 @@ pub(crate) struct Plane {
 }
 
 impl Plane {
-    /// Through `point` (relative to the receiver) with `normal`, turned away from the receiver.
+    /// Through `point` (relative to the receiver) with `normal`, turned away from the receiver. A receiver within `touch`
+    /// of the plane is taken to stand that far in front of it: at the foot of a wall the wall hides half of the sky.
     #[inline(always)]
-    pub(crate) fn through(point: Vec3, normal: Vec3) -> Self {
+    pub(crate) fn through(point: Vec3, normal: Vec3, touch: f32) -> Self {
         let distance = normal.dot(point);
-        if distance < 0.0 {
+        if distance < touch {
             Self {
                 normal: -normal,
-                distance: -distance,
+                distance: (-distance).max(touch),
             }
         } else {
             Self { normal, distance }

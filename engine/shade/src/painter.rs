@@ -16,6 +16,8 @@ const TWO_SHEETS_FILL: f32 = 1.6;
 /// Discs are drawn this much wider than their area says, because round ones of equal area leave gaps on a surface.
 const DISC_SCALE: f32 = 1.4;
 const NEAR_RADII: f32 = 6.0;
+/// Distance from a plane, as a share of half a voxel's edge or of a disc's radius, that is no distance.
+const TOUCH: f32 = 1e-3;
 /// Share of covered bits from which it pays to ask whether a voxel is hidden.
 const HIDDEN_TEST_SHARE: f32 = 0.1;
 /// Share of its section that a facet's points must cover to be drawn as the section. A leaf holds few points, so the share is
@@ -70,7 +72,7 @@ impl Painter<'_> {
     /// A piece of a plane: the section of its voxel if it fills that, else the rectangle of its covariance.
     #[inline(always)]
     fn draw_flat(&mut self, cluster: &Cluster, visit: &Visit) {
-        let plane = Plane::through(cluster.centroid, cluster.axis);
+        let plane = Plane::through(cluster.centroid, cluster.axis, TOUCH * visit.half);
         let toward = cluster.axis.dot(cluster.centroid) < 0.0;
         let (footprint, drawn_area) = if cluster.fill >= SECTION_FILL {
             let section = Footprint::voxel_section(self.frame, visit.center, visit.half, plane);
@@ -181,7 +183,7 @@ impl Painter<'_> {
 
     #[inline(always)]
     fn draw_facet(&mut self, facet: &Facet, cuts: &[(Vec3, f32)], visit: &Visit, receiver: &Receiver) {
-        let plane = Plane::through(facet.centroid, facet.normal);
+        let plane = Plane::through(facet.centroid, facet.normal, TOUCH * visit.half);
         let touched =
             is_aligned(receiver.normal, facet.normal) && plane.distance < self.walk.settings.bias * facet.radius;
         if touched || continues_surface(receiver.normal, facet.normal, facet.centroid) {
@@ -202,7 +204,7 @@ impl Painter<'_> {
     fn draw_disc(&mut self, point: &PointRecord, receiver: &Receiver) {
         let center = Vec3::from(point.position) - receiver.position;
         let normal = point.normal();
-        let plane = Plane::through(center, normal);
+        let plane = Plane::through(center, normal, TOUCH * point.radius);
         let distance = center.length();
         if distance < NEAR_RADII * point.radius {
             let touched =
