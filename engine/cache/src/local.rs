@@ -160,6 +160,8 @@ impl LocalCache {
             pool.put_in_front(tag, frame);
             return Some(frame);
         }
+        // Rule 10: room first, so that not even for a moment more is pinned than may be. A miss needs the room as well.
+        self.reserve(key.kind, 1);
         let Some(frame) = self.view.find_and_pin(key) else {
             self.counters.misses += 1;
             return None;
