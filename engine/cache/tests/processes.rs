@@ -6,7 +6,7 @@
 mod support;
 
 use pbgi_cache::channel::{PageOutcome, PageReply, PageRequest, Welcome, receive, send};
-use pbgi_cache::{CacheBudget, CacheError, CacheOwner, CacheView, LocalCache, Segment};
+use pbgi_cache::{CacheBudget, CacheError, CacheOwner, CacheView, LocalCache, Seat, Segment};
 use pbgi_core::{PageKey, PageKind};
 use rand::rngs::StdRng;
 use rand::{Rng, SeedableRng};
@@ -27,6 +27,8 @@ const SIGSEGV: i32 = 11;
 /// Exit codes of a worker.
 const WRONG_PAGE: i32 = 3;
 const REFUSED: i32 = 4;
+/// What the test in a tiny file system says at its end.
+const TINY_DONE: &str = "refused as it should be";
 /// Far longer than anything here takes.
 const PATIENCE: Duration = Duration::from_secs(60);
 
@@ -36,8 +38,10 @@ const PATIENCE: Duration = Duration::from_secs(60);
 #[test]
 fn worker_process() {
     let Ok(role) = std::env::var(ROLE) else { return };
-    if role == "tiny" {
-        return tiny_file_system();
+    match role.as_str() {
+        "tiny" => return tiny_file_system(),
+        "owner" => return owner_until_killed(),
+        _ => {}
     }
     let channel = UnixStream::from(std::io::stdin().as_fd().try_clone_to_owned().unwrap());
     let welcome: Welcome = receive(&channel).unwrap().unwrap();
@@ -413,7 +417,12 @@ fn cache_larger_than_a_tiny_file_system_is_refused_without_a_signal() {
         .env(ROLE, "tiny")
         .output();
     match child {
-        Ok(output) if output.status.success() => {}
+        Ok(output) if output.status.success() => {
+            assert!(
+                String::from_utf8_lossy(&output.stdout).contains(TINY_DONE),
+                "did not run"
+            );
+        }
         Ok(output) if output.status.code() == Some(101) || output.status.signal().is_some() => {
             panic!("{}: {}", output.status, String::from_utf8_lossy(&output.stderr))
         }
@@ -439,4 +448,52 @@ fn tiny_file_system() {
     drop(first);
     create(12 << 20).unwrap();
     assert_eq!(std::fs::read_dir("/dev/shm").unwrap().count(), 0);
+    println!("{TINY_DONE}");
+}
+
+/// Says the name first, as a daemon writes its state file first, then creates, then waits for its end.
+fn owner_until_killed() {
+    let channel = UnixStream::from(std::io::stdin().as_fd().try_clone_to_owned().unwrap());
+    let name = Segment::unique_name().unwrap();
+    let layout = layout(1, 16, 4, 2);
+    let welcome = |epoch| Welcome {
+        segment: name.clone(),
+        layout_hash: layout.hash(),
+        seat: Seat { slot: 0, epoch },
+        token: [0; 16],
+        daemon_pid: 0,
+        local_node_frames: 0,
+        local_point_frames: 0,
+    };
+    send(&channel, &welcome(0)).unwrap();
+    let _segment = Segment::create(&name, &layout).unwrap();
+    send(&channel, &welcome(1)).unwrap();
+    let _ = receive::<PageReply>(&channel);
+}
+
+#[test]
+fn segment_of_a_killed_owner_is_removed_by_its_name() {
+    for messages in [1, 2] {
+        for _ in 0..20 {
+            let (ours, theirs) = UnixStream::pair().unwrap();
+            let mut command = Command::new(std::env::current_exe().unwrap());
+            command
+                .args(["--exact", "worker_process", "--nocapture"])
+                .env(ROLE, "owner");
+            let mut child = command
+                .stdin(OwnedFd::from(theirs))
+                .stdout(Stdio::null())
+                .spawn()
+                .unwrap();
+            let mut name = String::new();
+            for _ in 0..messages {
+                name = receive::<Welcome>(&ours).unwrap().unwrap().segment;
+            }
+            child.kill().unwrap();
+            assert_eq!(child.wait().unwrap().signal(), Some(SIGKILL));
+            let existed = Segment::unlink(&name).unwrap();
+            assert!(existed || messages == 1, "a created segment was not found");
+            assert!(std::fs::metadata(format!("/dev/shm{name}")).is_err());
+        }
+    }
 }

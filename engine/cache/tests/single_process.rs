@@ -4,7 +4,7 @@
 mod support;
 
 use pbgi_cache::{
-    CacheBudget, CacheError, CacheOwner, CacheView, LoadError, LoadErrorKind, LocalCache, Origin, Segment,
+    CacheBudget, CacheError, CacheOwner, CacheView, JOBS_MAX, LoadError, LoadErrorKind, LocalCache, Origin, Segment,
 };
 use pbgi_core::PageKind;
 use std::sync::Barrier;
@@ -529,6 +529,47 @@ fn smallest_cache_that_is_planned_makes_progress_with_all_workers_at_their_limit
     assert_eq!(counters.node.redundant_reads + counters.point.redundant_reads, 0);
     assert!(counters.node.evictions > 100, "in {:?}", start.elapsed());
 }
+
+#[test]
+fn retaining_other_scenes_frees_an_unmounted_one() {
+    let owner = owner(1, 16, 4, 2);
+    owner.mount(OTHER_MOUNT, &scene(PAGES)).unwrap();
+    let mut worker = worker(&owner, 0);
+    let other = pbgi_core::PageKey {
+        mount: OTHER_MOUNT,
+        ..node(1)
+    };
+    for key in [node(1), node(2), other, point(1)] {
+        fetch_into(&owner, &mut worker, key, 1);
+    }
+    owner.unmount(MOUNT);
+    assert_eq!((owner.counters().node.doomed, owner.counters().point.doomed), (2, 1));
+    worker.retain(|mount| mount != MOUNT);
+    assert_eq!((owner.counters().node.doomed, owner.counters().point.doomed), (0, 0));
+    check(worker.get(other).unwrap(), other);
+    assert!(worker.get(node(1)).is_none());
+    assert_eq!(owner.pins(0, PageKind::Node), 1);
+}
+
+#[test]
+fn number_of_jobs_is_bounded() {
+    let owner = owner(1, 16, 4, 2);
+    let fetch = |job| owner.fetch(owner.seat(0).unwrap(), node(1), job, |page| fill(page, node(1)));
+    for job in 0..JOBS_MAX as u64 {
+        fetch(job).unwrap();
+    }
+    assert!(matches!(
+        fetch(JOBS_MAX as u64),
+        Err(CacheError::TooManyJobs { limit: JOBS_MAX })
+    ));
+    assert_eq!(owner.end_job(5).hits_other_job, 1);
+    fetch(JOBS_MAX as u64).unwrap();
+}
+
+const fn shared_by_threads<T: Send + Sync>() {}
+const fn moved_to_a_thread<T: Send>() {}
+const _: () = shared_by_threads::<CacheOwner>();
+const _: () = moved_to_a_thread::<LocalCache>();
 
 #[test]
 fn closed_cache_is_empty() {
