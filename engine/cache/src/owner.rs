@@ -94,7 +94,8 @@ impl CacheOwner {
         self.segment.layout()
     }
 
-    /// The seat of whoever is, or will next be, in a slot.
+    /// The seat of whoever is, or will next be, in a slot. Take it **before** the worker starts: taken later it may be that of a successor,
+    /// and requests that the dead worker left behind would pin for it.
     pub fn seat(&self, slot: u8) -> Result<Seat, CacheError> {
         let state = self.lock(PageKind::Node);
         match state.epochs.get(usize::from(slot)) {

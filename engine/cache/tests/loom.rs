@@ -4,6 +4,7 @@
 //!
 //! The code under test is the code in use; only the atomics and locks are loom's. `LOOM_MAX_PREEMPTIONS` changes the bound.
 #![cfg(loom)]
+#![allow(clippy::unwrap_used, reason = "a failed step of a test is a failed test")]
 
 use loom::cell::UnsafeCell;
 use loom::sync::atomic::AtomicU64;

@@ -1,5 +1,6 @@
 //! Every layout that is accepted keeps an evictable frame; every budget that is refused says what would do.
 #![cfg(not(loom))]
+#![allow(clippy::unwrap_used, reason = "a failed step of a test is a failed test")]
 
 use pbgi_cache::{CacheBudget, CacheError, PoolLayout, SegmentLayout};
 use pbgi_core::PageKind;
@@ -14,7 +15,7 @@ fn keeps_an_evictable_frame(layout: &SegmentLayout) {
             "{layout:?}"
         );
         assert!(pinned <= u64::from(pool.frames) / 2, "{layout:?}");
-        assert!(pool.local_frames > 0 && pool.frame_bytes % 4096 == 0);
+        assert!(pool.local_frames > 0 && pool.frame_bytes.is_multiple_of(4096));
     }
 }
 

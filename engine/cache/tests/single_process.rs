@@ -1,5 +1,6 @@
 //! Owner and views in one process: every promise that needs no second process.
 #![cfg(not(loom))]
+#![allow(clippy::unwrap_used, reason = "a failed step of a test is a failed test")]
 
 mod support;
 
