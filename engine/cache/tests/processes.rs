@@ -165,6 +165,8 @@ struct Started {
 }
 
 fn start(owner: &CacheOwner, slot: u8, role: &str, seed: u64, layout_hash: u64) -> Started {
+    // Taken before the worker lives: a request that it leaves behind must not find its successor's.
+    let seat = owner.seat(slot).unwrap();
     let (ours, theirs) = UnixStream::pair().unwrap();
     let mut command = Command::new(std::env::current_exe().unwrap());
     command
