@@ -147,7 +147,8 @@ impl PoolState {
 
     // Loading
 
-    /// Claims a frame to load the page of `tag` into; also the bytes that its old page, and others swept on the way, gave back.
+    /// Claims a frame to load the page of `tag` into; also the bytes that its old page, and others swept on the way,
+    /// gave back.
     pub(crate) fn claim(&mut self, map: &SegmentMap, tag: Tag) -> (Option<FrameId>, u64) {
         let mut freed = 0;
         if self.free.is_empty() {
