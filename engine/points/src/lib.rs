@@ -1,1 +1,39 @@
-//! Placeholder.
+//! Where points come from, and what pictures are made of.
+//!
+//! [`open_input`] turns files into one stream of lit points: meshes ([`MeshScene`]: glTF, OBJ) are sampled evenly and lit by
+//! their lights with shadow rays, clouds (PLY) are read as they are. [`GBuffer`] says what a camera sees, rendered from a
+//! mesh or read from another renderer's EXR passes. [`image`] writes the pictures. [`demo`] makes a scene on the spot.
+//!
+//! World space is the file's, y up; radiance is linear, W/(m2 sr). Nothing here keeps all points in memory. This crate does
+//! not build octrees and does not gather light.
+#![forbid(unsafe_code)]
+
+pub mod camera;
+pub mod demo;
+pub mod error;
+pub mod gbuffer;
+pub mod image;
+pub mod light;
+pub mod limits;
+pub mod ply;
+pub mod scene;
+
+mod charts;
+mod gltf_file;
+mod material;
+mod obj_file;
+mod open;
+mod output;
+mod sample;
+mod texture_file;
+mod trace;
+
+pub use crate::image::{Channel, LayeredImage, Precision, ToneMap, Window, read_environment, write_png};
+pub use camera::Camera;
+pub use error::PointsError;
+pub use gbuffer::{GBuffer, GBufferChannels};
+pub use light::{Light, LightKind};
+pub use open::{BoxedPointStream, Density, SampleOptions, open_input};
+pub use ply::write_point_ply;
+pub use sample::MeshPoints;
+pub use scene::MeshScene;

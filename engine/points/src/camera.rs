@@ -1,0 +1,110 @@
+//! Cameras: where primary rays start.
+
+use glam::{DMat4, DVec3, Mat4, Vec3};
+use pbgi_core::Bounds;
+
+/// A perspective camera in glTF's convention: it looks along its own -z, y up.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Camera {
+    /// Its name in the file.
+    pub name: Option<String>,
+    /// Camera space to world space; rotation and translation only.
+    pub world_from_camera: Mat4,
+    /// Vertical field of view, radians. It holds for every picture; the horizontal one follows from the picture's shape.
+    pub fov_y: f32,
+    /// Width over height that the file suggests.
+    pub aspect_ratio: Option<f32>,
+}
+
+impl Camera {
+    /// A camera at `eye` that looks at `target` with y up.
+    pub fn look_at(eye: Vec3, target: Vec3, fov_y: f32) -> Self {
+        let up = if (target - eye).normalize_or_zero().y.abs() > 0.999 {
+            Vec3::Z
+        } else {
+            Vec3::Y
+        };
+        Self {
+            name: None,
+            world_from_camera: Mat4::from_translation(eye) * rotation_to(target - eye, up),
+            fov_y,
+            aspect_ratio: None,
+        }
+    }
+
+    /// A camera outside of `bounds` that sees all of it from the front, a little from above and from the right: for files
+    /// without a camera.
+    pub fn framing(bounds: &Bounds) -> Self {
+        const FOV_Y: f32 = 0.7;
+        let centre = (Vec3::from(bounds.min) + Vec3::from(bounds.max)) / 2.0;
+        let radius = (bounds.diagonal() / 2.0).max(f32::MIN_POSITIVE);
+        let distance = radius / (FOV_Y / 2.0).sin();
+        let from = Vec3::new(0.5, 0.35, 1.0).normalize();
+        Self::look_at(centre + from * distance, centre, FOV_Y)
+    }
+
+    /// World position of the eye.
+    pub fn eye(&self) -> Vec3 {
+        self.world_from_camera.w_axis.truncate()
+    }
+
+    /// Unit direction of the ray through the centre of a pixel, world space; row 0 is at the top.
+    pub(crate) fn direction(&self, column: u32, row: u32, width: u32, height: u32) -> Vec3 {
+        let tangent = f64::from(self.fov_y / 2.0).tan();
+        let (width, height) = (f64::from(width), f64::from(height));
+        let x = (2.0 * (f64::from(column) + 0.5) - width) / height * tangent;
+        let y = (height - 2.0 * (f64::from(row) + 0.5)) / height * tangent;
+        let direction = self
+            .world_from_camera
+            .as_dmat4()
+            .transform_vector3(DVec3::new(x, y, -1.0));
+        direction.normalize().as_vec3()
+    }
+
+    /// The EXR attribute `worldToCamera` (column vectors): left-handed, +z along the view.
+    pub fn exr_world_to_camera(&self) -> Mat4 {
+        let camera_from_world = self.world_from_camera.as_dmat4().inverse();
+        (DMat4::from_scale(DVec3::new(1.0, 1.0, -1.0)) * camera_from_world).as_mat4()
+    }
+}
+
+/// Rotation that turns -z to `forward`.
+fn rotation_to(forward: Vec3, up: Vec3) -> Mat4 {
+    let back = -forward.normalize_or(Vec3::NEG_Z);
+    let right = up.cross(back).normalize_or(Vec3::X);
+    let up = back.cross(right);
+    Mat4::from_cols(right.extend(0.0), up.extend(0.0), back.extend(0.0), glam::Vec4::W)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_middle_of_the_picture_is_the_view_direction() {
+        let camera = Camera::look_at(Vec3::new(1.0, 2.0, 3.0), Vec3::new(-4.0, 0.0, 1.0), 0.8);
+        let direction = camera.direction(50, 50, 101, 101);
+        assert!(direction.distance(Vec3::new(-5.0, -2.0, -2.0).normalize()) < 1e-6);
+        let above = camera.direction(50, 0, 101, 101);
+        assert!(above.y > direction.y, "row 0 is at the top");
+    }
+
+    #[test]
+    fn the_exr_camera_is_left_handed_with_z_along_the_view() {
+        let camera = Camera::look_at(Vec3::ZERO, Vec3::NEG_Z, 0.8);
+        let matrix = camera.exr_world_to_camera();
+        assert!(matrix.determinant() < 0.0);
+        assert!(
+            matrix
+                .transform_point3(Vec3::new(0.0, 0.0, -5.0))
+                .distance(Vec3::new(0.0, 0.0, 5.0))
+                < 1e-6
+        );
+        assert!(
+            matrix
+                .transform_point3(Vec3::new(1.0, 2.0, -5.0))
+                .distance(Vec3::new(1.0, 2.0, 5.0))
+                < 1e-6
+        );
+    }
+}

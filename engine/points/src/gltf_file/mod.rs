@@ -1,0 +1,206 @@
+//! glTF and GLB: nodes, meshes, materials, lights and cameras become [`SceneParts`].
+//!
+//! Read: triangles, strips and fans; base colour, alpha mask, emission with strength; KHR_texture_transform,
+//! KHR_lights_punctual, KHR_materials_emissive_strength. Materials are diffuse: metalness and roughness are not looked at.
+//! `BLEND` is taken as a mask at an opacity of one half. Skins, morph targets and animations are not applied.
+
+mod accessor;
+mod buffers;
+mod materials;
+mod nodes;
+
+use crate::error::PointsError;
+use crate::limits;
+use crate::scene::{Geometry, Instance, SceneParts};
+use accessor::Accessors;
+use glam::{DAffine3, DMat3, Vec3};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Meshes whose placed triangles are fewer than this are copied into the world rather than placed: one BVH is faster.
+const COPIED_TRIANGLES_MAX: usize = 100_000;
+
+/// Reads a file and all that it names.
+pub(crate) fn read(path: &Path) -> Result<SceneParts, PointsError> {
+    let (document, blob) = buffers::open(path)?;
+    let buffers = buffers::load(path, &document, blob)?;
+    let visited = nodes::visit(path, &document)?;
+    let (materials, textures) = materials::load(path, &document, &buffers)?;
+    let mut parts = SceneParts {
+        materials,
+        textures,
+        lights: visited.lights,
+        cameras: visited.cameras,
+        ..SceneParts::default()
+    };
+    // Node transforms by mesh, meshes in ascending order.
+    let mut uses: BTreeMap<usize, Vec<DAffine3>> = BTreeMap::new();
+    for (mesh, transform) in visited.meshes {
+        uses.entry(mesh).or_default().push(transform);
+    }
+    let mut world = Geometry::default();
+    let accessors = Accessors::new(path, &document, &buffers);
+    for mesh in document.meshes() {
+        let Some(transforms) = uses.get(&mesh.index()) else {
+            continue;
+        };
+        let local = read_mesh(path, &accessors, &mesh, parts.materials.len())?;
+        let placed = local.triangles.len().saturating_mul(transforms.len());
+        if transforms.len() == 1 || placed <= COPIED_TRIANGLES_MAX {
+            transforms
+                .iter()
+                .try_for_each(|transform| world.append(path, &local, transform))?;
+            continue;
+        }
+        parts
+            .instances
+            .extend(transforms.iter().map(|&world_from_local| Instance {
+                geometry: parts.geometries.len(),
+                world_from_local,
+            }));
+        parts.geometries.push(local);
+    }
+    if !world.triangles.is_empty() {
+        parts.instances.push(Instance {
+            geometry: parts.geometries.len(),
+            world_from_local: DAffine3::IDENTITY,
+        });
+        parts.geometries.push(world);
+    }
+    Ok(parts)
+}
+
+fn read_mesh(
+    path: &Path,
+    accessors: &Accessors<'_>,
+    mesh: &gltf::Mesh<'_>,
+    material_count: usize,
+) -> Result<Geometry, PointsError> {
+    let mut geometry = Geometry::default();
+    for primitive in mesh.primitives() {
+        let place = format!("mesh {} primitive {}", mesh.index(), primitive.index());
+        let Some(positions) = primitive.get(&gltf::Semantic::Positions) else {
+            continue;
+        };
+        let positions = accessors.vectors::<3>(&positions, &place)?;
+        if let Some(index) = positions.iter().position(|p| !Vec3::from(*p).is_finite()) {
+            let what = format!("{place}: vertex {index} is not finite: {:?}", positions[index]);
+            return Err(PointsError::invalid(path, what));
+        }
+        let indices = match primitive.indices() {
+            Some(indices) => accessors.indices(&indices, &place)?,
+            None => (0..positions.len() as u32).collect(),
+        };
+        if let Some(index) = indices.iter().find(|&&index| index as usize >= positions.len()) {
+            let count = positions.len();
+            let what = format!("{place}: index {index} is beyond its {count} vertices");
+            return Err(PointsError::invalid(path, what));
+        }
+        let attribute = |semantic: gltf::Semantic| primitive.get(&semantic);
+        let mut piece = Geometry {
+            triangles: triangles_of(primitive.mode(), &indices),
+            ..Geometry::default()
+        };
+        if let Some(normals) = attribute(gltf::Semantic::Normals) {
+            piece.normals = accessors.vectors::<3>(&normals, &place)?;
+        }
+        for (set, uvs) in piece.uvs.iter_mut().enumerate() {
+            if let Some(accessor) = attribute(gltf::Semantic::TexCoords(set as u32)) {
+                *uvs = accessors.vectors::<2>(&accessor, &place)?;
+            }
+        }
+        // The last material is the default one.
+        let material = primitive.material().index().unwrap_or(material_count - 1);
+        piece.materials = vec![material as u32; piece.triangles.len()];
+        piece.positions = positions;
+        geometry.append(path, &piece, &DAffine3::IDENTITY)?;
+    }
+    Ok(geometry)
+}
+
+fn triangles_of(mode: gltf::mesh::Mode, indices: &[u32]) -> Vec<[u32; 3]> {
+    use gltf::mesh::Mode;
+    match mode {
+        Mode::Triangles => indices.as_chunks::<3>().0.to_vec(),
+        Mode::TriangleStrip => {
+            let turned = |(i, w): (usize, &[u32])| {
+                if i % 2 == 0 {
+                    [w[0], w[1], w[2]]
+                } else {
+                    [w[1], w[0], w[2]]
+                }
+            };
+            indices.windows(3).enumerate().map(turned).collect()
+        }
+        Mode::TriangleFan => {
+            let rim = indices.get(1..).unwrap_or_default();
+            rim.windows(2).map(|pair| [indices[0], pair[0], pair[1]]).collect()
+        }
+        Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip => Vec::new(),
+    }
+}
+
+impl Geometry {
+    /// Adds `other`, transformed. Triangles without area are dropped; mirrored ones are turned round.
+    pub(crate) fn append(&mut self, path: &Path, other: &Self, transform: &DAffine3) -> Result<(), PointsError> {
+        let base = self.positions.len();
+        let (vertices, triangles) = (
+            base + other.positions.len(),
+            self.triangles.len() + other.triangles.len(),
+        );
+        let largest = vertices.max(triangles);
+        if largest > limits::TRIANGLES_MAX {
+            return Err(PointsError::Limit {
+                what: "number of triangles or vertices",
+                value: largest as u64,
+                limit: limits::TRIANGLES_MAX as u64,
+                path: path.to_owned(),
+            });
+        }
+        let placed = other.positions.iter().map(|&position| {
+            let world = transform.transform_point3(Vec3::from(position).as_dvec3());
+            world.as_vec3().to_array()
+        });
+        self.positions.extend(placed);
+        pad(&mut self.normals, &other.normals, base, other.positions.len());
+        if let Some(new) = self.normals.get_mut(base..) {
+            turn_normals(new, transform.matrix3);
+        }
+        for (mine, theirs) in self.uvs.iter_mut().zip(&other.uvs) {
+            pad(mine, theirs, base, other.positions.len());
+        }
+        let mirrored = transform.matrix3.determinant() < 0.0;
+        for (&[a, b, c], &material) in other.triangles.iter().zip(&other.materials) {
+            let (b, c) = if mirrored { (c, b) } else { (b, c) };
+            let triangle = [a, b, c].map(|index| index + base as u32);
+            let [a, b, c] = triangle.map(|index| Vec3::from(self.positions[index as usize]).as_dvec3());
+            if (b - a).cross(c - a).length_squared() > 0.0 {
+                self.triangles.push(triangle);
+                self.materials.push(material);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Appends attributes of `count` vertices after `base` others, keeping an attribute that nobody has empty.
+fn pad<const N: usize>(mine: &mut Vec<[f32; N]>, theirs: &[[f32; N]], base: usize, count: usize) {
+    if mine.is_empty() && theirs.is_empty() {
+        return;
+    }
+    mine.resize(base, [0.0; N]);
+    mine.extend_from_slice(&theirs[..theirs.len().min(count)]);
+    mine.resize(base + count, [0.0; N]);
+}
+
+fn turn_normals(normals: &mut [[f32; 3]], world_from_local: DMat3) {
+    if world_from_local == DMat3::IDENTITY {
+        return;
+    }
+    // The cofactors, up to a sign that the user of vertex normals does not look at.
+    let normal_matrix = world_from_local.inverse().transpose();
+    for normal in normals {
+        let turned = normal_matrix * Vec3::from(*normal).as_dvec3();
+        *normal = turned.normalize_or_zero().as_vec3().to_array();
+    }
+}

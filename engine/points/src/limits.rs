@@ -1,0 +1,62 @@
+//! Bounds and defaults of this crate, each with its reason.
+
+/// Points sampled from a mesh when neither a count nor a spacing is given: a room at 2 million points has 2 to 3 cm discs,
+/// and the whole render takes a minute or two on two cores.
+pub const POINTS_DEFAULT: u64 = 2_000_000;
+
+/// Most points asked of a mesh: positions on the Morton lattice stop being distinct long before.
+pub const POINTS_MAX: u64 = 1 << 40;
+
+/// Points in one batch of a stream: large enough to share between threads, small enough to stay in the caches.
+pub const BATCH_POINTS: usize = 16_384;
+
+/// Points lit by one thread at a time.
+pub const LIGHT_CHUNK_POINTS: usize = 1024;
+
+/// Threads that light points or trace primary rays, unless the caller says otherwise.
+pub const THREADS_DEFAULT: usize = 2;
+
+/// Most channels of an EXR file.
+pub const EXR_CHANNELS_MAX: usize = 64;
+
+/// Most parts of an EXR file whose headers are looked at.
+pub const EXR_PARTS_MAX: usize = 64;
+
+/// Edge of the tiles of EXR files that we write, pixels: the tiles of the work queue.
+pub const EXR_TILE_EDGE: usize = pbgi_core::limits::TILE_EDGE as usize;
+
+/// Most bytes of a PLY header.
+pub const PLY_HEADER_BYTES_MAX: u64 = 1 << 16;
+
+/// Most properties of one PLY element.
+pub const PLY_PROPERTIES_MAX: usize = 256;
+
+/// Longest line of an ASCII PLY file.
+pub const PLY_LINE_BYTES_MAX: usize = 1 << 16;
+
+/// Most elements in a list property that is skipped.
+pub const PLY_LIST_MAX: u64 = 1 << 20;
+
+/// Most bytes of a mesh file or one of its buffers.
+pub const MESH_FILE_BYTES_MAX: u64 = 8 << 30;
+
+/// Deepest node hierarchy of a mesh file: a cycle would have no end.
+pub const NODE_DEPTH_MAX: usize = 256;
+
+/// Most placed meshes in a scene.
+pub const INSTANCES_MAX: usize = 1 << 22;
+
+/// Most triangles of one mesh: 32-bit indices.
+pub const TRIANGLES_MAX: usize = 1 << 30;
+
+/// Most pixels along one edge of a texture.
+pub const TEXTURE_EDGE_MAX: u32 = 1 << 15;
+
+/// Most bytes that decoding one texture may take.
+pub const TEXTURE_BYTES_MAX: u64 = 1 << 30;
+
+/// Most bytes of the decoded pixels of an EXR file, all channels together.
+pub const EXR_BYTES_MAX: u64 = 4 << 30;
+
+/// Most bytes of one tile or block of scanlines of an EXR file, decoded.
+pub const EXR_BLOCK_BYTES_MAX: u64 = 1 << 30;

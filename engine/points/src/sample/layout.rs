@@ -1,0 +1,303 @@
+//! Where points lie on a surface: on a hexagonal lattice in the plane of each chart, or, on charts too small for one,
+//! wherever the area summed along them passes the next whole point.
+
+use crate::scene::{Instance, MeshScene, SurfaceId, area_vector};
+use glam::{DAffine2, DMat2, DVec2, DVec3, Vec3};
+use std::f64::consts::{PI, TAU};
+
+/// Charts of fewer points than this are sampled along their summed area: a lattice is only even inside of its border.
+const LATTICE_POINTS_MIN: f64 = 12.0;
+
+/// A triangle that leans further than this from its chart's plane (placed geometry that is scaled unevenly) is sampled
+/// along its area: a lattice would be stretched too much.
+const LEAN_COS_MIN: f64 = 0.7;
+
+/// A disc on a surface, not yet lit.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Surfel {
+    pub(crate) position: Vec3,
+    /// Unit, on the front.
+    pub(crate) normal: Vec3,
+    pub(crate) radius: f32,
+    pub(crate) surface: SurfaceId,
+}
+
+/// Walks over all surfaces of a scene and lays out points, always the same ones.
+#[derive(Clone)]
+pub(crate) struct Layout {
+    /// Area of a point, square world units.
+    area: f64,
+    instance: usize,
+    chart: usize,
+    /// Next triangle of the chart.
+    triangle: usize,
+    plane: Option<Plane>,
+    /// The triangle whose lattice points are being handed out.
+    rows: Option<Rows>,
+    /// The triangle that is being sampled along its area.
+    along: Option<Face>,
+    /// Area since the last point that was not on a lattice, in points.
+    owed: f64,
+    /// Points not on a lattice so far: index into the sequence that places them.
+    sequence: u64,
+}
+
+/// A chart's plane: world space to lattice coordinates, in which points lie at whole numbers.
+#[derive(Clone, Copy)]
+struct Plane {
+    origin: DVec3,
+    normal: DVec3,
+    axes: [DVec3; 2],
+    lattice_from_plane: DAffine2,
+}
+
+/// A placed triangle.
+#[derive(Clone, Copy)]
+struct Face {
+    corners: [DVec3; 3],
+    normal: DVec3,
+    area: f64,
+    instance: u32,
+    triangle: u32,
+}
+
+/// The lattice points of one triangle, row by row.
+#[derive(Clone)]
+struct Rows {
+    face: Face,
+    /// Corners in lattice coordinates.
+    corners: [DVec2; 3],
+    radius: f32,
+    row: i64,
+    row_end: i64,
+    column: i64,
+    column_end: i64,
+}
+
+impl Layout {
+    /// Points of `area` square units each.
+    pub(crate) fn new(area: f64) -> Self {
+        Self {
+            area,
+            instance: 0,
+            chart: 0,
+            triangle: 0,
+            plane: None,
+            rows: None,
+            along: None,
+            owed: 0.5,
+            sequence: 0,
+        }
+    }
+
+    /// Appends surfels until there are `wanted` or no more; `false` at the end of the scene.
+    pub(crate) fn fill(&mut self, scene: &MeshScene, wanted: usize, surfels: &mut Vec<Surfel>) -> bool {
+        while surfels.len() < wanted {
+            if let Some(rows) = &mut self.rows {
+                match rows.next() {
+                    Some(surfel) => surfels.push(surfel),
+                    None => self.rows = None,
+                }
+            } else if let Some(face) = self.along {
+                match self.next_along(&face) {
+                    Some(surfel) => surfels.push(surfel),
+                    None => self.along = None,
+                }
+            } else if !self.step(scene) {
+                return !surfels.is_empty();
+            }
+        }
+        true
+    }
+
+    /// Takes the next triangle; `false` when there is none.
+    fn step(&mut self, scene: &MeshScene) -> bool {
+        let Some(instance) = scene.instances.get(self.instance) else {
+            return false;
+        };
+        let geometry = &scene.geometries[instance.geometry];
+        if self.chart >= geometry.charts.len() {
+            self.instance += 1;
+            self.chart = 0;
+            return true;
+        }
+        let triangles = geometry.charts.triangles(self.chart);
+        if self.triangle == 0 {
+            self.plane = self.plane_of(scene, instance, triangles);
+        }
+        let Some(&triangle) = triangles.get(self.triangle) else {
+            self.chart += 1;
+            self.triangle = 0;
+            return true;
+        };
+        self.triangle += 1;
+        let face = Face::new(scene, self.instance, triangle);
+        if face.area <= 0.0 {
+            return true;
+        }
+        match self.plane {
+            Some(plane) if plane.normal.dot(face.normal) >= LEAN_COS_MIN => {
+                self.rows = Rows::new(face, &plane, self.area);
+            }
+            _ => {
+                self.owed += face.area / self.area;
+                self.along = Some(face);
+            }
+        }
+        true
+    }
+
+    /// The lattice of a chart that is large enough for one.
+    fn plane_of(&self, scene: &MeshScene, instance: &Instance, triangles: &[u32]) -> Option<Plane> {
+        let geometry = &scene.geometries[instance.geometry];
+        let points = |triangle: &u32| area_vector(&instance.corners(geometry, *triangle as usize)).length() / self.area;
+        if triangles.iter().map(points).sum::<f64>() < LATTICE_POINTS_MIN {
+            return None;
+        }
+        let seed = Face::new(scene, self.instance, *triangles.first()?);
+        let noise = |salt: u64| {
+            let seed = (self.instance as u64) << 32 ^ self.chart as u64;
+            hash(seed ^ hash(salt)) as f64 / 2f64.powi(64)
+        };
+        let edge = (self.area * 2.0 / 3f64.sqrt()).sqrt();
+        let plane_from_lattice = DMat2::from_angle(noise(1) * TAU)
+            * DMat2::from_cols(DVec2::new(edge, 0.0), DVec2::new(edge / 2.0, edge * 3f64.sqrt() / 2.0));
+        let lattice_from_plane = DAffine2 {
+            matrix2: plane_from_lattice.inverse(),
+            translation: DVec2::new(noise(2), noise(3)),
+        };
+        let (u, v) = seed.normal.any_orthonormal_pair();
+        Some(Plane {
+            origin: seed.corners[0],
+            normal: seed.normal,
+            axes: [u, v],
+            lattice_from_plane,
+        })
+    }
+
+    fn next_along(&mut self, face: &Face) -> Option<Surfel> {
+        if self.owed < 1.0 {
+            return None;
+        }
+        self.owed -= 1.0;
+        let [v, w] = r2(self.sequence);
+        self.sequence += 1;
+        // The far half of the parallelogram is folded onto the triangle.
+        let (v, w) = if v + w > 1.0 { (1.0 - v, 1.0 - w) } else { (v, w) };
+        Some(face.surfel(v, w, radius_of(self.area)))
+    }
+}
+
+impl Face {
+    fn new(scene: &MeshScene, index: usize, triangle: u32) -> Self {
+        let instance = &scene.instances[index];
+        let corners = instance.corners(&scene.geometries[instance.geometry], triangle as usize);
+        let vector = area_vector(&corners);
+        let front = if instance.mirrors() { -vector } else { vector };
+        Self {
+            corners,
+            normal: front.normalize_or_zero(),
+            area: vector.length(),
+            instance: index as u32,
+            triangle,
+        }
+    }
+
+    fn surfel(&self, v: f64, w: f64, radius: f32) -> Surfel {
+        let [a, b, c] = self.corners;
+        let position = a * (1.0 - v - w) + b * v + c * w;
+        Surfel {
+            position: position.as_vec3(),
+            normal: self.normal.as_vec3(),
+            radius,
+            surface: SurfaceId {
+                instance: self.instance,
+                triangle: self.triangle,
+                barycentric: [v as f32, w as f32],
+            },
+        }
+    }
+}
+
+impl Plane {
+    fn lattice(&self, world: DVec3) -> DVec2 {
+        let offset = world - self.origin;
+        let on_plane = DVec2::new(offset.dot(self.axes[0]), offset.dot(self.axes[1]));
+        self.lattice_from_plane.transform_point2(on_plane)
+    }
+}
+
+impl Rows {
+    /// `None` where no row crosses the triangle.
+    fn new(face: Face, plane: &Plane, area: f64) -> Option<Self> {
+        let corners = face.corners.map(|corner| plane.lattice(corner));
+        let low = corners.iter().map(|corner| corner.y).fold(f64::INFINITY, f64::min);
+        let high = corners.iter().map(|corner| corner.y).fold(f64::NEG_INFINITY, f64::max);
+        // Rows from the first at or above the lowest corner to the last below the highest.
+        let (row, row_end) = (low.ceil() as i64, high.ceil() as i64);
+        (row < row_end).then(|| Self {
+            face,
+            corners,
+            radius: radius_of(area / plane.normal.dot(face.normal)),
+            row: row - 1,
+            row_end,
+            column: 0,
+            column_end: 0,
+        })
+    }
+
+    fn next(&mut self) -> Option<Surfel> {
+        while self.column >= self.column_end {
+            self.row += 1;
+            if self.row >= self.row_end {
+                return None;
+            }
+            [self.column, self.column_end] = self.columns(self.row as f64);
+        }
+        let point = DVec2::new(self.column as f64, self.row as f64);
+        self.column += 1;
+        let [a, b, c] = self.corners;
+        let whole = (b - a).perp_dot(c - a);
+        let v = ((point - a).perp_dot(c - a) / whole).clamp(0.0, 1.0);
+        let w = ((b - a).perp_dot(point - a) / whole).clamp(0.0, 1.0 - v);
+        Some(self.face.surfel(v, w, self.radius))
+    }
+
+    /// The columns of a row that lie inside: half open, and each edge is computed alike from both of its triangles, so
+    /// that no point is lost or given twice.
+    fn columns(&self, row: f64) -> [i64; 2] {
+        let mut crossings = [f64::NAN; 2];
+        let mut count = 0;
+        for edge in 0..3 {
+            let (a, b) = (self.corners[edge], self.corners[(edge + 1) % 3]);
+            let (low, high) = if (a.y, a.x) <= (b.y, b.x) { (a, b) } else { (b, a) };
+            if low.y <= row && row < high.y && count < 2 {
+                crossings[count] = low.x + (row - low.y) / (high.y - low.y) * (high.x - low.x);
+                count += 1;
+            }
+        }
+        if count < 2 {
+            return [0, 0];
+        }
+        let (left, right) = (crossings[0].min(crossings[1]), crossings[0].max(crossings[1]));
+        [left.ceil() as i64, right.ceil() as i64]
+    }
+}
+
+fn radius_of(area: f64) -> f32 {
+    (area / PI).sqrt() as f32
+}
+
+/// The R2 sequence: evenly spread points of the unit square (M. Roberts, 2018: multiples of the plastic ratio's powers).
+fn r2(index: u64) -> [f64; 2] {
+    const STEPS: [f64; 2] = [0.754_877_666_246_692_8, 0.569_840_290_998_053_3];
+    STEPS.map(|step| (0.5 + step * index as f64).fract())
+}
+
+/// SplitMix64's finalizer.
+fn hash(value: u64) -> u64 {
+    let mut z = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ z >> 31
+}

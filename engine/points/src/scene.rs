@@ -1,0 +1,335 @@
+//! A mesh scene in memory: triangles, where they are placed, what they are made of, lights and cameras.
+
+use crate::camera::Camera;
+use crate::charts::Charts;
+use crate::error::PointsError;
+use crate::light::Light;
+use crate::material::{Material, Texture};
+use crate::trace::Tracer;
+use crate::{gltf_file, limits, obj_file};
+use glam::{DAffine3, DVec3, Vec2, Vec3};
+use pbgi_core::Bounds;
+use std::path::Path;
+
+/// Triangles with materials and textures, lights and cameras, ready to be sampled and traced. A mesh that is placed many
+/// times is kept once.
+pub struct MeshScene {
+    pub(crate) geometries: Vec<Geometry>,
+    pub(crate) instances: Vec<Instance>,
+    pub(crate) materials: Vec<Material>,
+    pub(crate) textures: Vec<Texture>,
+    lights: Vec<Light>,
+    cameras: Vec<Camera>,
+    bounds: Bounds,
+    area: f64,
+    tracer: Tracer,
+}
+
+/// Triangles in their own space.
+#[derive(Default)]
+pub(crate) struct Geometry {
+    pub(crate) positions: Vec<[f32; 3]>,
+    /// A normal a position, zero where the file has none; or empty.
+    pub(crate) normals: Vec<[f32; 3]>,
+    /// Two sets of texture coordinates, each a pair a position, or empty.
+    pub(crate) uvs: [Vec<[f32; 2]>; 2],
+    pub(crate) triangles: Vec<[u32; 3]>,
+    /// A material a triangle.
+    pub(crate) materials: Vec<u32>,
+    /// Nearly flat pieces, the unit of sampling.
+    pub(crate) charts: Charts,
+}
+
+/// A geometry placed in the world.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Instance {
+    pub(crate) geometry: usize,
+    pub(crate) world_from_local: DAffine3,
+}
+
+/// A triangle's corner weights for its second and third corner.
+pub(crate) type Barycentric = [f32; 2];
+
+/// A place on a surface.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SurfaceId {
+    pub(crate) instance: u32,
+    pub(crate) triangle: u32,
+    pub(crate) barycentric: Barycentric,
+}
+
+/// What a place on a surface looks like.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Appearance {
+    pub(crate) albedo: Vec3,
+    /// Radiance of the front, and of the back if `double_sided`.
+    pub(crate) emission: Vec3,
+    pub(crate) double_sided: bool,
+}
+
+/// What a reader makes of a file, before it is checked and indexed.
+#[derive(Default)]
+pub(crate) struct SceneParts {
+    pub(crate) geometries: Vec<Geometry>,
+    pub(crate) instances: Vec<Instance>,
+    pub(crate) materials: Vec<Material>,
+    pub(crate) textures: Vec<Texture>,
+    pub(crate) lights: Vec<Light>,
+    pub(crate) cameras: Vec<Camera>,
+}
+
+impl MeshScene {
+    /// Reads a mesh file: `.gltf`, `.glb` or `.obj`, with the buffers and textures it names.
+    ///
+    /// # Errors
+    /// No or a damaged file, a missing buffer or texture, an unsupported feature, no triangles, a vertex that is not finite.
+    pub fn load(path: &Path) -> Result<Self, PointsError> {
+        Self::load_all(&[path])
+    }
+
+    /// Reads several mesh files into one scene.
+    ///
+    /// # Errors
+    /// As [`Self::load`], for the first file that cannot be read.
+    pub fn load_all(paths: &[&Path]) -> Result<Self, PointsError> {
+        let mut all = SceneParts::default();
+        for path in paths {
+            let parts = match crate::open::extension(path).as_str() {
+                "gltf" | "glb" => gltf_file::read(path)?,
+                "obj" => obj_file::read(path)?,
+                other => {
+                    let what = format!("a mesh of kind {other:?}");
+                    return Err(PointsError::unsupported(
+                        path,
+                        what,
+                        "convert it to .glb, .gltf or .obj",
+                    ));
+                }
+            };
+            parts.check(path)?;
+            all.append(parts);
+        }
+        Ok(Self::from_parts(all))
+    }
+
+    fn from_parts(mut parts: SceneParts) -> Self {
+        for geometry in &mut parts.geometries {
+            geometry.charts = Charts::of(&geometry.positions, &geometry.triangles);
+        }
+        let mut bounds = Bounds::EMPTY;
+        let mut area = 0.0;
+        for instance in &parts.instances {
+            let geometry = &parts.geometries[instance.geometry];
+            for triangle in 0..geometry.triangles.len() {
+                let corners = instance.corners(geometry, triangle);
+                corners
+                    .iter()
+                    .for_each(|corner| bounds.include(corner.as_vec3().to_array()));
+                area += area_vector(&corners).length();
+            }
+        }
+        let tracer = Tracer::new(&parts.geometries, &parts.instances);
+        Self {
+            geometries: parts.geometries,
+            instances: parts.instances,
+            materials: parts.materials,
+            textures: parts.textures,
+            lights: parts.lights,
+            cameras: parts.cameras,
+            bounds,
+            area,
+            tracer,
+        }
+    }
+
+    /// The exact box of all triangles, world space.
+    pub fn bounds(&self) -> Bounds {
+        self.bounds
+    }
+
+    /// Area of all triangles, square world units, cut-outs included.
+    pub fn area(&self) -> f64 {
+        self.area
+    }
+
+    /// Triangles, placed ones counted each time.
+    pub fn triangle_count(&self) -> u64 {
+        let count = |instance: &Instance| self.geometries[instance.geometry].triangles.len() as u64;
+        self.instances.iter().map(count).sum()
+    }
+
+    /// The punctual lights.
+    pub fn lights(&self) -> &[Light] {
+        &self.lights
+    }
+
+    /// The cameras, in the file's order.
+    pub fn cameras(&self) -> &[Camera] {
+        &self.cameras
+    }
+
+    /// Camera number `index`; the first of a file without cameras is one that sees everything ([`Camera::framing`]).
+    ///
+    /// # Errors
+    /// There is no such camera.
+    pub fn camera(&self, index: usize) -> Result<Camera, PointsError> {
+        if self.cameras.is_empty() && index == 0 {
+            return Ok(Camera::framing(&self.bounds));
+        }
+        self.cameras.get(index).cloned().ok_or_else(|| {
+            let count = self.cameras.len();
+            PointsError::Request(format!(
+                "camera {index} is asked for, the scene has {count} (counted from 0)"
+            ))
+        })
+    }
+
+    pub(crate) fn tracer(&self) -> &Tracer {
+        &self.tracer
+    }
+
+    /// How far a ray must start from a surface not to hit it: a few hundred roundings of the largest coordinate at play.
+    pub(crate) fn ray_offset(&self, position: Vec3) -> f32 {
+        const ROUNDINGS: f32 = 256.0 * f32::EPSILON / 2.0;
+        /// Surfaces of a scene far smaller than its place in the world.
+        const EXTENT_SHARE: f32 = 0.1;
+        (position.abs().max_element() + EXTENT_SHARE * self.bounds.diagonal()) * ROUNDINGS
+    }
+
+    /// Whether there is surface at this place of a triangle: its opacity reaches the cutoff.
+    pub(crate) fn is_opaque(&self, geometry: usize, triangle: usize, barycentric: Barycentric) -> bool {
+        let geometry = &self.geometries[geometry];
+        let material = &self.materials[geometry.materials[triangle] as usize];
+        let Some(cutoff) = material.cutoff else {
+            return true;
+        };
+        let textured = material.albedo_texture.as_ref().map_or(1.0, |slot| {
+            let uv = geometry.uv(slot.uv_set, triangle, barycentric);
+            self.textures[slot.texture].alpha(slot, uv)
+        });
+        textured * material.alpha >= cutoff
+    }
+
+    pub(crate) fn appearance(&self, geometry: usize, triangle: usize, barycentric: Barycentric) -> Appearance {
+        let geometry = &self.geometries[geometry];
+        let material = &self.materials[geometry.materials[triangle] as usize];
+        let textured = |slot: &Option<crate::material::TextureSlot>| {
+            slot.as_ref().map_or(Vec3::ONE, |slot| {
+                let uv = geometry.uv(slot.uv_set, triangle, barycentric);
+                let [r, g, b, _] = self.textures[slot.texture].sample(slot, uv);
+                Vec3::new(r, g, b)
+            })
+        };
+        let emission = if material.emits() {
+            Vec3::from(material.emission) * textured(&material.emission_texture)
+        } else {
+            Vec3::ZERO
+        };
+        Appearance {
+            albedo: Vec3::from(material.albedo) * textured(&material.albedo_texture),
+            emission,
+            double_sided: material.double_sided,
+        }
+    }
+}
+
+impl SceneParts {
+    fn append(&mut self, mut other: Self) {
+        let (geometries, materials, textures) = (self.geometries.len(), self.materials.len(), self.textures.len());
+        for geometry in &mut other.geometries {
+            geometry
+                .materials
+                .iter_mut()
+                .for_each(|material| *material += materials as u32);
+        }
+        for instance in &mut other.instances {
+            instance.geometry += geometries;
+        }
+        for material in &mut other.materials {
+            let slots = [&mut material.albedo_texture, &mut material.emission_texture];
+            slots.into_iter().flatten().for_each(|slot| slot.texture += textures);
+        }
+        self.geometries.append(&mut other.geometries);
+        self.instances.append(&mut other.instances);
+        self.materials.append(&mut other.materials);
+        self.textures.append(&mut other.textures);
+        self.lights.append(&mut other.lights);
+        self.cameras.append(&mut other.cameras);
+    }
+
+    /// What no later code looks at again: there are triangles, and every placed vertex is a finite f32.
+    fn check(&self, path: &Path) -> Result<(), PointsError> {
+        let placed = |instance: &Instance| self.geometries[instance.geometry].triangles.len();
+        let triangles: usize = self.instances.iter().map(placed).sum();
+        if triangles == 0 {
+            let what =
+                "the file has no triangles of any area in its scene: export a mesh, not only points, lines or curves";
+            return Err(PointsError::invalid(path, what));
+        }
+        if self.instances.len() > limits::INSTANCES_MAX {
+            return Err(PointsError::Limit {
+                what: "number of placed meshes",
+                value: self.instances.len() as u64,
+                limit: limits::INSTANCES_MAX as u64,
+                path: path.to_owned(),
+            });
+        }
+        for instance in &self.instances {
+            for (index, &position) in self.geometries[instance.geometry].positions.iter().enumerate() {
+                let world = instance
+                    .world_from_local
+                    .transform_point3(Vec3::from(position).as_dvec3());
+                if !world.as_vec3().is_finite() {
+                    let what = format!("vertex {index} is not finite in world space: {position:?}");
+                    return Err(PointsError::invalid(path, what));
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Geometry {
+    /// Corner positions in its own space.
+    pub(crate) fn corners(&self, triangle: usize) -> [Vec3; 3] {
+        self.triangles[triangle].map(|index| Vec3::from(self.positions[index as usize]))
+    }
+
+    fn uv(&self, set: usize, triangle: usize, [v, w]: Barycentric) -> Vec2 {
+        let corner = |index: u32| {
+            self.uvs[set]
+                .get(index as usize)
+                .map_or(Vec2::ZERO, |uv| Vec2::from(*uv))
+        };
+        let [a, b, c] = self.triangles[triangle].map(corner);
+        a * (1.0 - v - w) + b * v + c * w
+    }
+
+    /// Interpolated vertex normal in its own space, if the file has them here.
+    pub(crate) fn vertex_normal(&self, triangle: usize, [v, w]: Barycentric) -> Option<Vec3> {
+        if self.normals.is_empty() {
+            return None;
+        }
+        let [a, b, c] = self.triangles[triangle].map(|index| Vec3::from(self.normals[index as usize]));
+        (a * (1.0 - v - w) + b * v + c * w).try_normalize()
+    }
+}
+
+impl Instance {
+    /// Corner positions in the world.
+    pub(crate) fn corners(&self, geometry: &Geometry, triangle: usize) -> [DVec3; 3] {
+        geometry
+            .corners(triangle)
+            .map(|corner| self.world_from_local.transform_point3(corner.as_dvec3()))
+    }
+
+    /// Whether it mirrors: the front of its triangles is then on the other side of their winding.
+    pub(crate) fn mirrors(&self) -> bool {
+        self.world_from_local.matrix3.determinant() < 0.0
+    }
+}
+
+/// Normal of a counter-clockwise triangle times its area.
+pub(crate) fn area_vector([a, b, c]: &[DVec3; 3]) -> DVec3 {
+    (b - a).cross(c - a) * 0.5
+}
