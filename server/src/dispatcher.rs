@@ -21,7 +21,7 @@ use pbgi_cache::CacheOwner;
 use pbgi_core::{Environment, MountId, SceneInfo, ShadeSettings};
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
 use tokio::sync::{Notify, Semaphore, watch};
 use tracing::{Instrument, Span};
@@ -164,8 +164,11 @@ impl Dispatcher {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // A panic under this lock is a bug that the panic hook of the program turns into an abort.
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock().unwrap_or_else(|_| {
+            // A panic in the middle of a change: nobody may see what it left. The next start cleans up.
+            tracing::error!("the dispatcher panicked");
+            std::process::abort()
+        })
     }
 
     /// Runs an event through the scheduler and carries out what follows. Answers to a worker are returned.
