@@ -238,7 +238,7 @@ pub enum PageOutcome {
     Failed(LoadErrorKind),
 }
 
-/// The daemon's answer.
+/// The daemon's answer. Every page that it calls pinned has to be adopted, also when another one failed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PageReply {
     /// Number of the request.

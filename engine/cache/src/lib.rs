@@ -61,7 +61,7 @@ pub use {
     error::{CacheError, LoadError, LoadErrorKind},
     layout::{PoolLayout, SegmentLayout},
     local::{LocalCache, LocalCounters},
-    owner::{CacheOwner, Fetched, Origin, Seat},
+    owner::{CacheOwner, Fetched, JOBS_MAX, Origin, Seat},
     plan::CacheBudget,
     segment::Segment,
 };

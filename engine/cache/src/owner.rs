@@ -22,6 +22,10 @@ const EVICTABLE_WAIT: Duration = Duration::from_secs(10);
 /// Unpinning wakes nobody (it is a bit in a worker's ledger), so waiting for it looks again this often.
 const EVICTABLE_POLL: Duration = Duration::from_millis(5);
 
+/// Jobs whose counters are kept at a time; a fetch for one more is refused. Far more than a daemon runs at once, so only a server that
+/// forgets [`CacheOwner::end_job`], or a worker that makes numbers up, comes here.
+pub const JOBS_MAX: usize = 16_384;
+
 /// A worker's seat: a slot, and how often the slot was given to a new worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Seat {
@@ -220,7 +224,7 @@ impl CacheOwner {
         }
     }
 
-    /// The counters of a job.
+    /// The counters of a job. A record is kept for each job number until [`CacheOwner::end_job`], for [`JOBS_MAX`] at most.
     pub fn job_counters(&self, job: u64) -> JobCounters {
         let mut sum = JobCounters::default();
         for kind in KINDS {
@@ -270,7 +274,8 @@ impl CacheOwner {
                 drop(state);
                 let frame = flight.wait()?;
                 let mut state = self.lock(kind);
-                state.check(seat, key)?; // Reaped meanwhile: then nothing was pinned, or is no longer.
+                // Reaped meanwhile: then nothing was pinned, or is no longer. An unmount meanwhile leaves the pin good.
+                state.check_seat(seat)?;
                 let origin = state.count_hit(map, frame, job, false);
                 return Ok(Admission::Done(Fetched { frame, origin }));
             }

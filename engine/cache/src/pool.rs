@@ -7,7 +7,7 @@ use crate::frame::{FrameId, Tag, TagState};
 use crate::layout::SegmentLayout;
 use crate::ledger::{Ledgers, word_and_mask};
 use crate::map::SegmentMap;
-use crate::owner::{Origin, Seat};
+use crate::owner::{JOBS_MAX, Origin, Seat};
 use crate::page_table;
 use crate::protocol::{FullFence, load_tag, owner_pin, publish, try_claim};
 use crate::victim::Clock;
@@ -306,6 +306,9 @@ impl PoolState {
 
     pub(crate) fn count_fetch(&mut self, seat: Seat, key: PageKey, job: u64) -> Result<(), CacheError> {
         self.check(seat, key)?;
+        if self.jobs.len() >= JOBS_MAX && !self.jobs.contains_key(&job) {
+            return Err(CacheError::TooManyJobs { limit: JOBS_MAX });
+        }
         self.counters.fetches += 1;
         self.jobs.entry(job).or_default().counters.fetches += 1;
         Ok(())

@@ -52,6 +52,15 @@ impl Segment {
 
     /// Creates the segment, with mode 0600, and reserves all of it. A segment of that name must not exist. On error nothing is left behind.
     pub fn create(name: &str, layout: &SegmentLayout) -> Result<Self, CacheError> {
+        let needed = layout.total_bytes();
+        // Asked first, because an attempt to reserve takes what there is before it fails; the attempt itself is what counts.
+        match available() {
+            Some(available) if available < needed => Err(CacheError::NoSpace { needed, available }),
+            _ => Self::create_unasked(name, layout),
+        }
+    }
+
+    fn create_unasked(name: &str, layout: &SegmentLayout) -> Result<Self, CacheError> {
         check_name(name)?;
         check_page_size(name)?;
         let needed = layout.total_bytes();
@@ -195,7 +204,7 @@ fn reserve(name: &str, descriptor: &OwnedFd, needed: u64) -> Result<(), CacheErr
             Err(Errno::ENOSPC | Errno::EFBIG) => {
                 return Err(CacheError::NoSpace {
                     needed,
-                    available: available(),
+                    available: available().unwrap_or(0),
                 });
             }
             Err(error) => return Err(os("reserve", name, error)),
@@ -203,7 +212,42 @@ fn reserve(name: &str, descriptor: &OwnedFd, needed: u64) -> Result<(), CacheErr
     }
 }
 
-/// Bytes left for shared memory; 0 where that cannot be told. The failed reservation has been given back by now.
-fn available() -> u64 {
-    nix::sys::statvfs::statvfs(SHM_DIRECTORY).map_or(0, |status| status.blocks_available() * status.fragment_size())
+/// Bytes left for shared memory, if that can be told.
+fn available() -> Option<u64> {
+    let status = nix::sys::statvfs::statvfs(SHM_DIRECTORY).ok()?;
+    Some(status.blocks_available() * status.fragment_size())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layout::PoolLayout;
+
+    #[test]
+    fn reservation_that_fails_leaves_no_segment_and_no_signal() {
+        let status = nix::sys::statvfs::statvfs(SHM_DIRECTORY).unwrap();
+        let size = status.blocks() * status.fragment_size();
+        let frames = size / (16 << 20) + 2;
+        if frames > 1 << 24 {
+            eprintln!("SKIPPED: {SHM_DIRECTORY} of {size} bytes is too large to exceed");
+            return;
+        }
+        let point = PoolLayout {
+            frame_bytes: 4096,
+            frames: 8,
+            local_frames: 1,
+        };
+        let node = PoolLayout {
+            frame_bytes: 16 << 20,
+            frames: frames as u32,
+            local_frames: 1,
+        };
+        let layout = SegmentLayout::new(1, 1, node, point).unwrap();
+        let name = Segment::unique_name().unwrap();
+        match Segment::create_unasked(&name, &layout) {
+            Err(CacheError::NoSpace { needed, available }) => assert!(needed > size && available <= size),
+            other => panic!("{other:?}"),
+        }
+        assert!(!Segment::unlink(&name).unwrap(), "a segment was left");
+    }
 }
