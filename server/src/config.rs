@@ -1,0 +1,172 @@
+//! What the daemon runs with: one value, checked once.
+
+use crate::budget::{Machine, MemoryPlan};
+use crate::error::ServerError;
+use crate::limits;
+use pbgi_cache::{CacheBudget, SegmentLayout};
+use pbgi_core::limits::{NODES_PER_PAGE_DEFAULT, POINTS_PER_PAGE_DEFAULT, RECORDS_PER_PAGE_RANGE, WORKERS_MAX};
+use pbgi_core::{NodeRecord, PointRecord};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// What was asked for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Options {
+    /// Where the sockets are made.
+    pub runtime_dir: PathBuf,
+    /// Where lock, state file and log are.
+    pub state_dir: PathBuf,
+    /// Where builds put their temporary files.
+    pub scratch_dir: PathBuf,
+    /// All memory; `None` lets the machine decide.
+    pub memory_bytes: Option<u64>,
+    /// Worker processes.
+    pub workers: usize,
+    /// Exit after so long without jobs.
+    pub idle: Option<Duration>,
+    /// The worker program.
+    pub worker_binary: PathBuf,
+    /// This program, for build children.
+    pub server_binary: PathBuf,
+    /// Largest node page that will be cached, in records.
+    pub nodes_per_page: u32,
+    /// Largest point page that will be cached, in records.
+    pub points_per_page: u32,
+}
+
+impl Options {
+    /// Defaults below one directory, for tests and embedders.
+    pub fn below(directory: &Path, worker_binary: PathBuf, server_binary: PathBuf) -> Self {
+        Self {
+            runtime_dir: directory.join("run"),
+            state_dir: directory.join("state"),
+            scratch_dir: directory.join("scratch"),
+            memory_bytes: Some(256 << 20),
+            workers: 1,
+            idle: None,
+            worker_binary,
+            server_binary,
+            nodes_per_page: NODES_PER_PAGE_DEFAULT,
+            points_per_page: POINTS_PER_PAGE_DEFAULT,
+        }
+    }
+}
+
+/// Options that hold on this machine.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// What was asked for.
+    pub options: Options,
+    /// How the memory is divided.
+    pub memory: MemoryPlan,
+    /// The cache.
+    pub layout: SegmentLayout,
+}
+
+impl Config {
+    /// Checks every option.
+    ///
+    /// # Errors
+    /// The first option that cannot be, named; or memory that is not there.
+    pub fn new(options: Options, machine: &Machine) -> Result<Self, ServerError> {
+        let workers = range("--workers", options.workers as u64, 1..=WORKERS_MAX as u64)? as u32;
+        let records = u64::from(*RECORDS_PER_PAGE_RANGE.start())..=u64::from(*RECORDS_PER_PAGE_RANGE.end());
+        range("--nodes-per-page", u64::from(options.nodes_per_page), records.clone())?;
+        range("--points-per-page", u64::from(options.points_per_page), records)?;
+        for socket in [options.jobs_socket(), options.queue_socket()] {
+            let bytes = socket.as_os_str().len();
+            if bytes >= limits::SOCKET_PATH_BYTES_MAX {
+                return Err(ServerError::Option {
+                    name: "--runtime-dir",
+                    value: format!("{bytes} bytes long with the socket's name"),
+                    expected: format!("shorter than {}", limits::SOCKET_PATH_BYTES_MAX),
+                });
+            }
+        }
+        let memory = MemoryPlan::new(options.memory_bytes, workers, machine)?;
+        let node_page = options.nodes_per_page as usize * size_of::<NodeRecord>();
+        let point_page = options.points_per_page as usize * size_of::<PointRecord>();
+        let loads = workers * limits::LOADS_PER_WORKER;
+        let layout = CacheBudget::new(memory.segment_bytes, workers, node_page, point_page, loads).plan()?;
+        Ok(Self {
+            options,
+            memory,
+            layout,
+        })
+    }
+}
+
+impl Options {
+    /// The socket of clients.
+    pub fn jobs_socket(&self) -> PathBuf {
+        self.runtime_dir.join("jobs.sock")
+    }
+
+    /// The socket of workers.
+    pub fn queue_socket(&self) -> PathBuf {
+        self.runtime_dir.join("queue.sock")
+    }
+
+    /// The log of a private daemon.
+    pub fn log_file(&self) -> PathBuf {
+        self.state_dir.join("server.log")
+    }
+}
+
+fn range(name: &'static str, value: u64, allowed: std::ops::RangeInclusive<u64>) -> Result<u64, ServerError> {
+    if allowed.contains(&value) {
+        return Ok(value);
+    }
+    Err(ServerError::Option {
+        name,
+        value: value.to_string(),
+        expected: format!("from {} to {}", allowed.start(), allowed.end()),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MACHINE: Machine = Machine {
+        shared_free_bytes: 100 << 30,
+        limit_bytes: None,
+    };
+
+    fn options() -> Options {
+        Options::below(Path::new("/tmp/p"), "worker".into(), "server".into())
+    }
+
+    #[test]
+    fn nonsense_is_refused_by_name() {
+        let cases: [(fn(&mut Options), &str); 4] = [
+            (|o| o.workers = 0, "--workers is 0, must be from 1 to 64"),
+            (|o| o.workers = 65, "--workers is 65"),
+            (|o| o.nodes_per_page = 1, "--nodes-per-page is 1"),
+            (|o| o.runtime_dir = "/tmp".repeat(30).into(), "--runtime-dir is 130 bytes long"),
+        ];
+        for (change, text) in cases {
+            let mut options = options();
+            change(&mut options);
+            let error = Config::new(options, &MACHINE).unwrap_err();
+            assert!(error.to_string().contains(text), "{error}");
+            assert_eq!(error.exit_code(), 2);
+        }
+    }
+
+    #[test]
+    fn budget_too_small_for_the_cache_is_refused_with_both_numbers() {
+        let mut options = options();
+        options.memory_bytes = Some(48 << 20);
+        options.points_per_page = 131_072;
+        let error = Config::new(options, &MACHINE).unwrap_err();
+        assert_eq!(error.exit_code(), 78, "{error}");
+    }
+
+    #[test]
+    fn segment_stays_within_its_share() {
+        let config = Config::new(options(), &MACHINE).unwrap();
+        assert!(config.layout.total_bytes() <= config.memory.segment_bytes);
+        assert!(config.layout.total_bytes() * 10 > config.memory.segment_bytes * 9);
+    }
+}

@@ -1,0 +1,245 @@
+//! What a job is to the rest of the daemon: its request, and what can be told about it.
+
+use crate::error::{JobError, JobErrorKind};
+use crate::limits;
+use crate::scheduler::{JobNo, Kind};
+use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// How densely meshes are sampled.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Density {
+    /// The default of the sampler.
+    Default,
+    /// Distance between points, world units.
+    Spacing(f32),
+    /// Number of points.
+    Points(u64),
+}
+
+/// Points or meshes in, a scene out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BuildTask {
+    /// Input files, absolute.
+    pub inputs: Vec<PathBuf>,
+    /// The scene directory, absolute.
+    pub output: PathBuf,
+    /// Whether a scene that is there is replaced.
+    pub overwrite: bool,
+    /// How.
+    pub settings: BuildSettings,
+    /// For meshes.
+    pub density: Density,
+}
+
+/// A scene and a G-buffer in, a picture out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ShadeTask {
+    /// The scene directory, absolute.
+    pub scene: PathBuf,
+    /// The G-buffer, absolute.
+    pub gbuffer: PathBuf,
+    /// The picture, absolute.
+    pub output: PathBuf,
+    /// Whether a picture that is there is replaced.
+    pub overwrite: bool,
+    /// How.
+    pub settings: ShadeSettings,
+    /// The environment map, absolute; `None` for black.
+    pub environment: Option<PathBuf>,
+    /// Most workers at once; `None` for all.
+    pub workers: Option<usize>,
+}
+
+/// What a client asks for.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Request {
+    /// A scene.
+    Build(BuildTask),
+    /// A picture.
+    Shade(ShadeTask),
+}
+
+impl Request {
+    /// Checks what can be checked without opening a file.
+    ///
+    /// # Errors
+    /// [`JobErrorKind::Invalid`], naming the field.
+    pub fn validate(&self) -> Result<(), JobError> {
+        let invalid = |error: pbgi_core::SettingsError| JobError::invalid(error.to_string());
+        match self {
+            Self::Build(task) => {
+                task.settings.validate().map_err(invalid)?;
+                if task.inputs.is_empty() || task.inputs.len() > limits::BUILD_INPUTS_MAX {
+                    let max = limits::BUILD_INPUTS_MAX;
+                    return Err(JobError::invalid(format!("{} inputs given, must be 1 to {max}", task.inputs.len())));
+                }
+                match task.density {
+                    Density::Spacing(spacing) if !(spacing > 0.0 && spacing.is_finite()) => {
+                        return Err(JobError::invalid(format!("spacing is {spacing}, must be above 0")));
+                    }
+                    Density::Points(0) => return Err(JobError::invalid("points is 0, must be above 0")),
+                    _ => {}
+                }
+                task.inputs.iter().try_for_each(|path| check_path("input", path))
+            }
+            Self::Shade(task) => {
+                task.settings.validate().map_err(invalid)?;
+                check_path("scene", &task.scene)?;
+                check_path("gbuffer", &task.gbuffer)?;
+                task.environment.iter().try_for_each(|path| check_path("environment", path))
+            }
+        }?;
+        check_path("output", self.output())
+    }
+
+    /// Where the result goes.
+    pub fn output(&self) -> &Path {
+        match self {
+            Self::Build(task) => &task.output,
+            Self::Shade(task) => &task.output,
+        }
+    }
+
+    /// For people.
+    pub fn title(&self) -> String {
+        let name = self.output().file_name().unwrap_or_default().to_string_lossy();
+        match self {
+            Self::Build(_) => format!("build {name}"),
+            Self::Shade(_) => format!("shade {name}"),
+        }
+    }
+
+    /// For the scheduler.
+    pub fn kind(&self) -> Kind {
+        match self {
+            Self::Build(_) => Kind::Build,
+            Self::Shade(task) => Kind::Shade {
+                workers_max: task.workers.unwrap_or(usize::MAX),
+            },
+        }
+    }
+}
+
+fn check_path(field: &str, path: &Path) -> Result<(), JobError> {
+    let bytes = path.as_os_str().as_encoded_bytes();
+    let wrong = if bytes.is_empty() {
+        "is empty"
+    } else if !path.is_absolute() {
+        "is not absolute"
+    } else if bytes.contains(&0) {
+        "has a zero byte"
+    } else if bytes.len() > limits::PATH_BYTES_MAX {
+        "is too long"
+    } else if path.file_name().is_none() {
+        "names no file"
+    } else {
+        return Ok(());
+    };
+    Err(JobError::invalid(format!("{field} path {wrong}: {}", path.display())))
+}
+
+/// Checks a client's name for a job.
+///
+/// # Errors
+/// [`JobErrorKind::Invalid`].
+pub fn check_job_id(id: &str) -> Result<(), JobError> {
+    let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"._-".contains(&byte);
+    if id.is_empty() || id.len() > limits::JOB_ID_CHARS_MAX || !id.bytes().all(allowed) {
+        let max = limits::JOB_ID_CHARS_MAX;
+        return Err(JobError::invalid(format!("job id must be 1 to {max} characters of A-Z a-z 0-9 . _ -")));
+    }
+    Ok(())
+}
+
+/// Where a job is in its life.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum JobState {
+    /// Waits.
+    Queued,
+    /// Runs.
+    Running,
+    /// Its output is in place.
+    Succeeded,
+    /// It will not be.
+    Failed,
+    /// Somebody asked.
+    Cancelled,
+}
+
+impl JobState {
+    /// Whether nothing more will happen.
+    pub fn ended(self) -> bool {
+        matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
+    }
+}
+
+/// What can be told about a job at a moment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JobStatus {
+    /// The client's name for it.
+    pub id: String,
+    /// Number, for order.
+    pub number: JobNo,
+    /// Where it is.
+    pub state: JobState,
+    /// What it is doing, for people.
+    pub stage: &'static str,
+    /// Units done.
+    pub done: u64,
+    /// Units in all; 0 while unknown.
+    pub total: u64,
+    /// Why it failed.
+    pub error: String,
+    /// Complete when the job is.
+    pub statistics: Statistics,
+    /// For people.
+    pub title: String,
+}
+
+/// The error for a job that is not there.
+pub fn no_such_job(id: &str) -> JobError {
+    JobError::new(JobErrorKind::NotFound, format!("no job {id:?}: it never was, or ended long ago"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn job_names_are_checked() {
+        for good in ["a", "render-12_3.x", &"x".repeat(128)] {
+            check_job_id(good).unwrap();
+        }
+        for bad in ["", "a b", "ä", "a/b", &"x".repeat(129)] {
+            assert_eq!(check_job_id(bad).unwrap_err().kind, JobErrorKind::Invalid);
+        }
+    }
+
+    #[test]
+    fn requests_that_make_no_sense_are_refused_by_field() {
+        let good = BuildTask {
+            inputs: vec!["/in.ply".into()],
+            output: "/out.pbgi".into(),
+            overwrite: false,
+            settings: BuildSettings::default(),
+            density: Density::Default,
+        };
+        Request::Build(good.clone()).validate().unwrap();
+        let cases: [(fn(&mut BuildTask), &str); 6] = [
+            (|task| task.inputs.clear(), "0 inputs"),
+            (|task| task.inputs = vec!["in.ply".into()], "input path is not absolute"),
+            (|task| task.output = "/".into(), "output path names no file"),
+            (|task| task.density = Density::Spacing(f32::NAN), "spacing is NaN"),
+            (|task| task.density = Density::Points(0), "points is 0"),
+            (|task| task.settings.leaf_max = 0, "leaf-max is 0"),
+        ];
+        for (change, text) in cases {
+            let mut task = good.clone();
+            change(&mut task);
+            let error = Request::Build(task).validate().unwrap_err();
+            assert!(error.text.contains(text), "{error}");
+        }
+    }
+}
