@@ -82,7 +82,10 @@ impl MemoryPlan {
                 remedy: format!("give a larger --memory or fewer than {workers} --workers"),
             });
         }
-        let segment_bytes = ((total - fixed) as f64 * limits::SEGMENT_SHARE) as u64;
+        let shared = ((total - fixed) as f64 * limits::SEGMENT_SHARE) as u64;
+        // A small budget lends pages to builds, as long as that leaves the better half of it.
+        let builds = total - fixed - limits::BUILD_BYTES_MIN.min((total - fixed) / 2);
+        let segment_bytes = shared.min(builds);
         if segment_bytes > machine.shared_free_bytes {
             return Err(ServerError::Memory {
                 what: "shared memory in /dev/shm",
@@ -96,7 +99,7 @@ impl MemoryPlan {
             total_bytes: total,
             segment_bytes,
             work_bytes,
-            build_bytes: work_bytes / 2,
+            build_bytes: (work_bytes / 2).max(limits::BUILD_BYTES_MIN.min(work_bytes)),
         })
     }
 }
@@ -196,7 +199,7 @@ mod tests {
             let plan = MemoryPlan::new(Some(2 * G), workers, &machine).unwrap();
             let fixed = limits::DAEMON_RESERVE_BYTES + u64::from(workers) * limits::WORKER_RESERVE_BYTES;
             assert_eq!(plan.segment_bytes + plan.work_bytes + fixed, plan.total_bytes);
-            assert!(plan.build_bytes * 2 <= plan.work_bytes);
+            assert!(plan.build_bytes <= plan.work_bytes && plan.build_bytes >= limits::BUILD_BYTES_MIN);
         }
     }
 

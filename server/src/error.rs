@@ -108,6 +108,8 @@ pub enum JobErrorKind {
     NotFound,
     /// The name is taken by something else.
     Exists,
+    /// Another job is at it: wait for that one.
+    Busy,
     /// Something in the way: another state of the world is needed.
     Precondition,
     /// Too much is asked of this daemon.

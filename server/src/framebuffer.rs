@@ -4,6 +4,7 @@
 //! Tiles and groups lie on a grid anchored at the display window, so that a crop or an overscan does not move them. A tile's
 //! values take the place of its positions and normals, which nobody needs any more: a pixel is 32 bytes all along.
 
+use glam::Mat4;
 use pbgi_core::limits::{GROUP_EDGE, TILE_EDGE};
 use pbgi_points::{GBuffer, Window};
 
@@ -17,6 +18,7 @@ const VALUE_FLOATS: usize = 7;
 pub struct Framebuffer {
     data: Window,
     display: Window,
+    world_to_camera: Option<Mat4>,
     /// First column and row of tiles, and how many columns, on the grid of the display window.
     tile_origin: [i64; 2],
     tile_columns: u32,
@@ -47,6 +49,8 @@ pub struct Planes {
     pub data: Window,
     /// The picture they are part of.
     pub display: Window,
+    /// The camera, if the G-buffer has one.
+    pub world_to_camera: Option<Mat4>,
     /// W/m2.
     pub irradiance: Vec<[f32; 3]>,
     /// 0 open, 1 closed.
@@ -64,6 +68,7 @@ impl Framebuffer {
         let GBuffer {
             data_window: data,
             display_window: display,
+            world_to_camera,
             mut position,
             mut normal,
             mut coverage,
@@ -81,6 +86,7 @@ impl Framebuffer {
         Self {
             data,
             display,
+            world_to_camera,
             tile_origin,
             tile_columns: (last_column - tile_origin[0] + 1).max(0) as u32,
             occlusion: vec![0.0; position.len()],
@@ -89,6 +95,11 @@ impl Framebuffer {
             coverage,
             holes: holes.len() as u64,
         }
+    }
+
+    /// Pixels.
+    pub fn pixel_count(&self) -> u64 {
+        self.coverage.len() as u64
     }
 
     /// Pixels without a receiver.
@@ -164,6 +175,7 @@ impl Framebuffer {
         Planes {
             data: self.data,
             display: self.display,
+            world_to_camera: self.world_to_camera,
             irradiance: self.first,
             occlusion: self.occlusion,
             bent_normal: self.second,

@@ -1,3 +1,32 @@
-//! x
+//! The daemon: takes build and shade jobs from clients, hands tiles to worker processes, loads their pages into the shared cache,
+//! and puts pictures together.
+//!
+//! Start at [`daemon::run`]. [`dispatcher`] is the middle: it holds the jobs and carries out what the pure [`scheduler`] says;
+//! [`supervisor`] makes and reaps processes, [`loader`] answers page faults, [`builder`] runs builds in a child. gRPC stays
+//! within [`rpc`]. This crate never shades: it does not link `pbgi-shade`.
 #![forbid(unsafe_code)]
+
+pub mod budget;
+pub mod build_child;
+pub mod builder;
+pub mod config;
+pub mod daemon;
+pub mod dispatcher;
+pub mod environment;
+pub mod error;
+pub mod framebuffer;
+pub mod job;
+pub mod limits;
+pub mod loader;
+pub mod memory;
+pub mod mounts;
+pub mod output;
+pub mod rpc;
 pub mod scheduler;
+pub mod shade_job;
+pub mod state;
+pub mod supervisor;
+
+pub use config::{Config, Options};
+pub use daemon::{Listeners, Stop, run};
+pub use error::ServerError;

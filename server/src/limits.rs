@@ -80,6 +80,8 @@ pub const DAEMON_RESERVE_BYTES: u64 = 24 << 20;
 pub const WORKER_RESERVE_BYTES: u64 = 16 << 20;
 /// Share of the rest that is pages in the segment; what remains is for builds and pictures.
 pub const SEGMENT_SHARE: f64 = 0.55;
+/// Memory that a build wants at least, where the budget has it: the least of pbgi-build, with room for its input.
+pub const BUILD_BYTES_MIN: u64 = 72 << 20;
 /// Bytes that one pixel of a picture takes while it is read, held and written.
 pub const PICTURE_BYTES_PER_PIXEL: u64 = 96;
 /// Share of a machine's limit that is taken without being asked to, and the most of a container's limit.

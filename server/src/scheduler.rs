@@ -116,6 +116,11 @@ pub enum Event {
         /// Whether it died of itself.
         death: Death,
     },
+    /// Workers cannot be had.
+    Workless {
+        /// Why not.
+        reason: String,
+    },
     /// Time passed.
     Tick,
     /// The daemon stops: nothing new, only leased tiles are finished.
@@ -215,6 +220,8 @@ pub struct Scheduler {
     doomed: HashSet<Seat>,
     lease_last: u64,
     draining: bool,
+    /// Why there are no workers, until one asks.
+    workless: Option<String>,
 }
 
 impl Scheduler {
@@ -230,6 +237,7 @@ impl Scheduler {
             Event::Heartbeat { seat, lease } => self.heartbeat(seat, lease, now, &mut effects),
             Event::Complete { seat, lease, failure } => self.complete(seat, lease, failure, &mut effects),
             Event::WorkerGone { seat, death } => self.worker_gone(seat, death, &mut effects),
+            Event::Workless { reason } => self.workless(reason, &mut effects),
             Event::Tick => self.tick(now, &mut effects),
             Event::Drain => self.drain(&mut effects),
         }
@@ -299,6 +307,10 @@ impl Scheduler {
         } else if job.phase == Phase::Started {
             job.pending = tiles.into();
             job.phase = Phase::Shading;
+            if let (Some(reason), false) = (&self.workless, job.pending.is_empty()) {
+                let end = End::Failed(reason.clone());
+                return self.end(number, end, effects);
+            }
             effects.push(Effect::Wake);
             self.check_done(number, effects);
         }
@@ -335,7 +347,17 @@ impl Scheduler {
         self.fill_lanes(effects);
     }
 
+    fn workless(&mut self, reason: String, effects: &mut Vec<Effect>) {
+        let shading = |(&number, job): (&JobNo, &Job)| (job.phase == Phase::Shading).then_some(number);
+        let numbers: Vec<JobNo> = self.jobs.iter().filter_map(shading).collect();
+        for number in numbers {
+            self.end(number, End::Failed(reason.clone()), effects);
+        }
+        self.workless = Some(reason);
+    }
+
     fn ask(&mut self, seat: Seat, now: Instant, effects: &mut Vec<Effect>) {
+        self.workless = None;
         if self.draining || self.doomed.contains(&seat) {
             return;
         }

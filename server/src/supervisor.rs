@@ -45,8 +45,8 @@ pub trait Nursery: Send {
     fn born(&mut self, birth: WorkerBirth, channel: UnixStream) -> Result<(), ServerError>;
     /// A worker is dead and waited for. Afterwards [`Self::seat`] gives another one.
     fn dead(&mut self, seat: Seat, death: Death);
-    /// How many slots are parked now.
-    fn parked(&mut self, slots: usize);
+    /// How many slots are parked now, and why the last one is.
+    fn parked(&mut self, slots: usize, reason: &str);
 }
 
 /// What the supervisor can be asked to do.
@@ -64,6 +64,8 @@ enum Command {
     StopBuild(u64),
     /// A build child's output closed.
     BuildHangup(u64),
+    /// Try parked slots again.
+    Unpark,
     /// Kill and reap everything; no more is started.
     Stop(SyncSender<()>),
 }
@@ -130,6 +132,11 @@ impl Handle {
     /// A worker's page channel closed.
     pub fn hangup(&self, seat: Seat) {
         self.send(Command::Hangup(seat));
+    }
+
+    /// Tries slots again that were parked long enough.
+    pub fn unpark(&self) {
+        self.send(Command::Unpark);
     }
 
     /// Starts a build child known by `id`.
@@ -237,6 +244,10 @@ impl<N: Nursery + 'static> Supervisor<N> {
             }
             Command::Build(order) => self.builds.start(&self.plan, order),
             Command::StopBuild(id) => self.builds.stop(id, Instant::now()),
+            Command::Unpark => {
+                let now = Instant::now();
+                self.slots.iter_mut().for_each(|slot| slot.unpark(now));
+            }
             Command::BuildHangup(_) | Command::Stop(_) => {}
         }
     }
@@ -250,10 +261,10 @@ impl<N: Nursery + 'static> Supervisor<N> {
                 slot.spawn(&self.plan, &mut self.nursery, now);
             }
         }
-        let parked = self.slots.iter().filter(|slot| slot.is_parked()).count();
-        if parked != self.parked {
-            self.parked = parked;
-            self.nursery.parked(parked);
+        let reasons: Vec<&str> = self.slots.iter().filter_map(Slot::parked).collect();
+        if reasons.len() != self.parked {
+            self.parked = reasons.len();
+            self.nursery.parked(reasons.len(), reasons.last().unwrap_or(&""));
         }
     }
 
@@ -277,3 +288,6 @@ impl<N: Nursery + 'static> Supervisor<N> {
 fn kill_now(pid: u32) {
     kill(pid, Signal::SIGKILL);
 }
+
+#[cfg(test)]
+mod tests;

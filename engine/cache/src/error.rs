@@ -134,6 +134,12 @@ pub enum CacheError {
         /// Pages of that file.
         pages: u64,
     },
+    /// Counters of as many jobs are kept as can be.
+    #[error("more than {limit} jobs use the cache at once; end some before starting more")]
+    TooManyJobs {
+        /// Jobs kept.
+        limit: usize,
+    },
     /// A page could not be loaded.
     #[error(transparent)]
     Load(#[from] LoadError),

@@ -1,14 +1,15 @@
 //! A worker's own cache: an exact LRU of pins on frames of the shared cache, never copies.
 //!
-//! A repeated hit costs a few nanoseconds and writes nothing shared: a small direct-mapped table answers it. Such hits only leave
-//! a time stamp there; before anything is evicted the stamps are replayed, oldest first, into the LRU order, which is therefore exact.
+//! A repeated hit costs a few nanoseconds and writes nothing shared: a small direct-mapped table answers it. Such
+//! hits only leave a time stamp there; before anything is evicted the stamps are replayed, oldest first, into the LRU
+//! order, which is therefore exact.
 
 use crate::attach::CacheView;
 use crate::error::CacheError;
 use crate::frame::{FrameId, Tag};
 use crate::layout::KINDS;
 use lru::LruCache;
-use pbgi_core::{PageKey, PageKind};
+use pbgi_core::{MountId, PageKey, PageKind};
 use std::hash::{BuildHasherDefault, Hasher};
 
 /// Entries of the front table, per pool: 6 KiB, which stay in the processor's first-level cache.
@@ -57,7 +58,8 @@ impl LocalCache {
 
     /// The page, if it is in the local or in the shared cache; then it is pinned, and most recently used.
     ///
-    /// The slice is a whole frame, aligned to 4,096 bytes: cut it to the scene's page size before casting it to records.
+    /// The slice is a whole frame, aligned to 4,096 bytes: cut it to the scene's page size before casting it to
+    /// records.
     #[inline]
     pub fn get(&mut self, key: PageKey) -> Option<&[u8]> {
         let tag = Tag::resident(key);
@@ -71,13 +73,14 @@ impl LocalCache {
         } else {
             self.find(key)?
         };
-        // SAFETY: Rule 4: the frame is in the local cache, so its pin is held; pins are given up only by methods that borrow `self`
-        // exclusively, which the result's lifetime forbids.
+        // SAFETY: Rule 4: the frame is in the local cache, so its pin is held; pins are given up only by methods that
+        // borrow `self` exclusively, which the result's lifetime forbids.
         Some(unsafe { self.view.frame(key.kind, frame) })
     }
 
-    /// Makes room for `count` pages of a kind, at most the capacity: **before** the owner is asked for them, since it pins them in this
-    /// worker's name and refuses to exceed the capacity (Rule 10).
+    /// Makes room for `count` pages of a kind (at most the capacity, so a request has no more either): **before** the
+    /// owner is asked for them, since it pins them in this worker's name and refuses to exceed the capacity (Rule
+    /// 10).
     pub fn reserve(&mut self, kind: PageKind, count: usize) {
         let pool = &mut self.pools[kind as usize];
         let capacity = pool.lru.cap().get();
@@ -85,16 +88,40 @@ impl LocalCache {
         if pool.lru.len() > keep {
             pool.replay();
         }
-        while pool.lru.len() > keep
-            && let Some((tag, frame)) = pool.lru.pop_lru()
+        while self.pools[kind as usize].lru.len() > keep
+            && let Some((tag, frame)) = self.pools[kind as usize].lru.pop_lru()
         {
-            let entry = &mut pool.front[front_index(tag)];
-            if entry.tag == tag {
-                *entry = FrontEntry::EMPTY;
-            }
-            self.view.unpin(kind, frame);
-            self.counters.evictions += 1;
+            self.release(kind, tag, frame);
         }
+    }
+
+    /// Gives up the pins on scenes that `keep` does not want: the owner frees an unmounted scene only as they go.
+    pub fn retain(&mut self, keep: impl Fn(MountId) -> bool) {
+        for kind in KINDS {
+            let pool = &mut self.pools[kind as usize];
+            pool.replay();
+            let gone: Vec<Tag> = pool
+                .lru
+                .iter()
+                .map(|(&tag, _)| tag)
+                .filter(|tag| !keep(tag.mount()))
+                .collect();
+            for tag in gone {
+                if let Some(frame) = self.pools[kind as usize].lru.pop(&tag) {
+                    self.release(kind, tag, frame);
+                }
+            }
+        }
+    }
+
+    /// Unpins a frame that the LRU has let go of.
+    fn release(&mut self, kind: PageKind, tag: Tag, frame: FrameId) {
+        let entry = &mut self.pools[kind as usize].front[front_index(tag)];
+        if entry.tag == tag {
+            *entry = FrontEntry::EMPTY;
+        }
+        self.view.unpin(kind, frame);
+        self.counters.evictions += 1;
     }
 
     /// Takes over a page that the owner pinned in this worker's name. Fails if the owner did no such thing.
@@ -160,6 +187,8 @@ impl LocalCache {
             pool.put_in_front(tag, frame);
             return Some(frame);
         }
+        // Rule 10: room first, so that not even for a moment more is pinned than may be. A miss needs the room as well.
+        self.reserve(key.kind, 1);
         let Some(frame) = self.view.find_and_pin(key) else {
             self.counters.misses += 1;
             return None;

@@ -1,8 +1,8 @@
-//! The page table: from a page to the frame that holds it. Open addressing with linear probing over words of the segment, written
-//! by the owner, searched by everyone (Rule 2).
+//! The page table: from a page to the frame that holds it. Open addressing with linear probing over words of the
+//! segment, written by the owner, searched by everyone (Rule 2).
 //!
-//! A slot is `hash << 32 | frame + 1`, or 0. The frame's tag is the truth, the slot only a hint: a search that runs while the
-//! owner moves slots may miss a page, and then asks the owner, who never does.
+//! A slot is `hash << 32 | frame + 1`, or 0. The frame's tag is the truth, the slot only a hint: a search that runs
+//! while the owner moves slots may miss a page, and then asks the owner, who never does.
 
 use crate::frame::FrameId;
 use std::sync::atomic::{AtomicU64, Ordering};

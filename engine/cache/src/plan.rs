@@ -40,8 +40,14 @@ impl CacheBudget {
         }
     }
 
-    /// Splits the budget: node and point pools by `node_share`, half of each pool to the workers' local caches in equal parts.
+    /// Splits the budget: node and point pools by `node_share`, half of each pool to the workers' local caches in
+    /// equal parts.
     pub fn plan(&self) -> Result<SegmentLayout, CacheError> {
+        if !(self.node_share > 0.0 && self.node_share < 1.0) {
+            return Err(CacheError::Layout {
+                what: format!("a node share of {}, above 0 and below 1 allowed", self.node_share),
+            });
+        }
         let fits = |frames: [u32; 2]| {
             self.layout(frames)
                 .is_ok_and(|layout| layout.total_bytes() <= self.bytes)
@@ -58,13 +64,8 @@ impl CacheBudget {
                 point_page_bytes: self.point_page_bytes,
             });
         }
-        let share = if self.node_share > 0.0 && self.node_share < 1.0 {
-            self.node_share
-        } else {
-            NODE_MEMORY_SHARE
-        };
         let frames_of = |page_bytes: u64| {
-            let node = page_bytes as f64 * share;
+            let node = page_bytes as f64 * self.node_share;
             let frames = |bytes: f64, page: usize| {
                 ((bytes / page.next_multiple_of(ALIGN) as f64) as u32).clamp(smallest, FRAMES_MAX)
             };
@@ -101,7 +102,8 @@ impl CacheBudget {
         )
     }
 
-    /// Fewest frames of a pool: every worker has its least, and as many plus the loads in flight and one more are evictable.
+    /// Fewest frames of a pool: every worker has its least, and as many plus the loads in flight and one more are
+    /// evictable.
     fn frames_min(&self) -> u32 {
         let local = self.workers.saturating_mul(LOCAL_FRAMES_MIN);
         let in_flight = self.loads_in_flight_max.saturating_add(1);

@@ -7,7 +7,7 @@ use crate::frame::{FrameId, Tag, TagState};
 use crate::layout::SegmentLayout;
 use crate::ledger::{Ledgers, word_and_mask};
 use crate::map::SegmentMap;
-use crate::owner::{Origin, Seat};
+use crate::owner::{JOBS_MAX, Origin, Seat};
 use crate::page_table;
 use crate::protocol::{FullFence, load_tag, owner_pin, publish, try_claim};
 use crate::victim::Clock;
@@ -147,7 +147,8 @@ impl PoolState {
 
     // Loading
 
-    /// Claims a frame to load the page of `tag` into; also the bytes that its old page, and others swept on the way, gave back.
+    /// Claims a frame to load the page of `tag` into; also the bytes that its old page, and others swept on the way,
+    /// gave back.
     pub(crate) fn claim(&mut self, map: &SegmentMap, tag: Tag) -> (Option<FrameId>, u64) {
         let mut freed = 0;
         if self.free.is_empty() {
@@ -306,6 +307,9 @@ impl PoolState {
 
     pub(crate) fn count_fetch(&mut self, seat: Seat, key: PageKey, job: u64) -> Result<(), CacheError> {
         self.check(seat, key)?;
+        if self.jobs.len() >= JOBS_MAX && !self.jobs.contains_key(&job) {
+            return Err(CacheError::TooManyJobs { limit: JOBS_MAX });
+        }
         self.counters.fetches += 1;
         self.jobs.entry(job).or_default().counters.fetches += 1;
         Ok(())

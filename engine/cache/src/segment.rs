@@ -22,8 +22,8 @@ const SHM_DIRECTORY: &str = "/dev/shm";
 
 /// The daemon's hold on the segment: made and reserved by [`Segment::create`], unlinked on drop.
 ///
-/// `shared_memory` creates, maps and unlinks it. It leaves the memory unreserved, where a touch may end in SIGBUS, so it is
-/// reserved here before the first touch.
+/// `shared_memory` creates, maps and unlinks it. It leaves the memory unreserved, where a touch may end in SIGBUS, so
+/// it is reserved here before the first touch.
 pub struct Segment {
     map: SegmentMap,
     name: String,
@@ -34,14 +34,15 @@ pub struct Segment {
 
 struct Mapping(Shmem);
 
-// SAFETY: Rule 9: the mapping is process-wide, used through `SegmentMap` only, and unmapped once, by whichever thread drops it.
+// SAFETY: Rule 9: the mapping is process-wide, used through `SegmentMap` only, and unmapped once, by whichever thread
+// drops it.
 unsafe impl Send for Mapping {}
 // SAFETY: as above; `Mapping` has no methods.
 unsafe impl Sync for Mapping {}
 
 impl Segment {
-    /// A name that nobody can guess (128 random bits). Write it to the state file before [`Segment::create`], so that whatever happens
-    /// the next start can [`Segment::unlink`] it.
+    /// A name that nobody can guess (128 random bits). Write it to the state file before [`Segment::create`], so that
+    /// whatever happens the next start can [`Segment::unlink`] it.
     pub fn unique_name() -> Result<String, CacheError> {
         let mut random = [0; NAME_DIGITS / 2];
         File::open("/dev/urandom")
@@ -50,8 +51,19 @@ impl Segment {
         Ok(format!("{NAME_PREFIX}{:032x}", u128::from_le_bytes(random)))
     }
 
-    /// Creates the segment, with mode 0600, and reserves all of it. A segment of that name must not exist. On error nothing is left behind.
+    /// Creates the segment, with mode 0600, and reserves all of it. A segment of that name must not exist. On error
+    /// nothing is left behind.
     pub fn create(name: &str, layout: &SegmentLayout) -> Result<Self, CacheError> {
+        let needed = layout.total_bytes();
+        // Asked first, because an attempt to reserve takes what there is before it fails; the attempt itself is what
+        // counts.
+        match available() {
+            Some(available) if available < needed => Err(CacheError::NoSpace { needed, available }),
+            _ => Self::create_unasked(name, layout),
+        }
+    }
+
+    fn create_unasked(name: &str, layout: &SegmentLayout) -> Result<Self, CacheError> {
         check_name(name)?;
         check_page_size(name)?;
         let needed = layout.total_bytes();
@@ -71,8 +83,8 @@ impl Segment {
         reserve(name, &descriptor, needed)?;
         let status = fstat(&descriptor).map_err(|error| os("inspect", name, error))?;
         let base = NonNull::new(memory.0.as_ptr()).ok_or_else(|| os("map", name, "null address"))?;
-        // SAFETY: Rules 1 and 9: freshly mapped with that many bytes, reserved above, kept in `_memory` beside the map, and
-        // written through the map alone.
+        // SAFETY: Rules 1 and 9: freshly mapped with that many bytes, reserved above, kept in `_memory` beside the
+        // map, and written through the map alone.
         let map = unsafe { SegmentMap::new(base, *layout) };
         // SAFETY: Rule 9: the segment is new and its name known to nobody who would attach before it is handed out.
         unsafe { map.write_header(&layout.header()) };
@@ -85,7 +97,8 @@ impl Segment {
         })
     }
 
-    /// Removes a segment that an earlier daemon left behind, by the name in the state file. Returns whether there was one.
+    /// Removes a segment that an earlier daemon left behind, by the name in the state file. Returns whether there was
+    /// one.
     ///
     /// Only names of this program's making are accepted. Processes that still map the segment keep it until they end.
     pub fn unlink(name: &str) -> Result<bool, CacheError> {
@@ -107,7 +120,8 @@ impl Segment {
         self.map.layout()
     }
 
-    /// Whether the name still leads to this segment. If somebody removed it, running workers go on, new ones cannot attach.
+    /// Whether the name still leads to this segment. If somebody removed it, running workers go on, new ones cannot
+    /// attach.
     pub fn linked(&self) -> Result<bool, CacheError> {
         let descriptor = match shm_open(self.name.as_str(), OFlag::O_RDONLY, Mode::empty()) {
             Ok(descriptor) => descriptor,
@@ -195,7 +209,7 @@ fn reserve(name: &str, descriptor: &OwnedFd, needed: u64) -> Result<(), CacheErr
             Err(Errno::ENOSPC | Errno::EFBIG) => {
                 return Err(CacheError::NoSpace {
                     needed,
-                    available: available(),
+                    available: available().unwrap_or(0),
                 });
             }
             Err(error) => return Err(os("reserve", name, error)),
@@ -203,7 +217,42 @@ fn reserve(name: &str, descriptor: &OwnedFd, needed: u64) -> Result<(), CacheErr
     }
 }
 
-/// Bytes left for shared memory; 0 where that cannot be told. The failed reservation has been given back by now.
-fn available() -> u64 {
-    nix::sys::statvfs::statvfs(SHM_DIRECTORY).map_or(0, |status| status.blocks_available() * status.fragment_size())
+/// Bytes left for shared memory, if that can be told.
+fn available() -> Option<u64> {
+    let status = nix::sys::statvfs::statvfs(SHM_DIRECTORY).ok()?;
+    Some(status.blocks_available() * status.fragment_size())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layout::PoolLayout;
+
+    #[test]
+    fn reservation_that_fails_leaves_no_segment_and_no_signal() {
+        let status = nix::sys::statvfs::statvfs(SHM_DIRECTORY).unwrap();
+        let size = status.blocks() * status.fragment_size();
+        let frames = size / (16 << 20) + 2;
+        if frames > 1 << 24 {
+            eprintln!("SKIPPED: {SHM_DIRECTORY} of {size} bytes is too large to exceed");
+            return;
+        }
+        let point = PoolLayout {
+            frame_bytes: 4096,
+            frames: 8,
+            local_frames: 1,
+        };
+        let node = PoolLayout {
+            frame_bytes: 16 << 20,
+            frames: frames as u32,
+            local_frames: 1,
+        };
+        let layout = SegmentLayout::new(1, 1, node, point).unwrap();
+        let name = Segment::unique_name().unwrap();
+        match Segment::create_unasked(&name, &layout) {
+            Err(CacheError::NoSpace { needed, available }) => assert!(needed > size && available <= size),
+            other => panic!("{other:?}"),
+        }
+        assert!(!Segment::unlink(&name).unwrap(), "a segment was left");
+    }
 }

@@ -7,7 +7,7 @@ use crate::frame::Frame;
 use crate::raster::LANES;
 use glam::Vec3;
 
-/// Half-spaces of the widest footprint: the octagon of a disc.
+/// Half-spaces of the widest footprint: a section cut by two facets, or the octagon of a disc.
 const HALF_SPACES_MAX: usize = 8;
 /// Apothem of an octagon over the radius of the disc of equal area.
 const OCTAGON_APOTHEM: f32 = 0.973_68;
@@ -43,14 +43,15 @@ pub(crate) struct Plane {
 }
 
 impl Plane {
-    /// Through `point` (relative to the receiver) with `normal`, turned away from the receiver.
+    /// Through `point` (relative to the receiver) with `normal`, turned away from the receiver. A receiver within `touch`
+    /// of the plane is taken to stand that far in front of it: at the foot of a wall the wall hides half of the sky.
     #[inline(always)]
-    pub(crate) fn through(point: Vec3, normal: Vec3) -> Self {
+    pub(crate) fn through(point: Vec3, normal: Vec3, touch: f32) -> Self {
         let distance = normal.dot(point);
-        if distance < 0.0 {
+        if distance < touch {
             Self {
                 normal: -normal,
-                distance: -distance,
+                distance: (-distance).max(touch),
             }
         } else {
             Self { normal, distance }
@@ -142,6 +143,13 @@ impl Footprint {
             footprint.add_slab(normal, plane.distance, axis, middle - half, middle + half);
         }
         footprint
+    }
+
+    /// Keeps the part of a section with `cut.x >= distance`; world directions, relative to the receiver.
+    #[inline(always)]
+    pub(crate) fn cut(&mut self, frame: &Frame, plane: Plane, cut: Vec3, distance: f32) {
+        let (normal, cut) = (frame.local_from_world(plane.normal), frame.local_from_world(cut));
+        self.add_half_space(cut * plane.distance - normal * distance);
     }
 
     /// A square that hides a sphere; `center` relative to the receiver, farther than `radius`.

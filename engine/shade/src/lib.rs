@@ -5,10 +5,13 @@
 //! This crate knows no files and no shared memory. See `README.md` beside it for the method and where it leaves the paper.
 #![deny(unsafe_code)]
 
+mod cluster;
 mod cut;
 mod environment;
+mod facet;
 mod footprint;
 mod frame;
+mod painter;
 mod raster;
 mod shader;
 mod simd;

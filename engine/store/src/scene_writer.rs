@@ -84,6 +84,21 @@ impl SceneWriter {
         })
     }
 
+    /// Bytes that may still be written where the scene is.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn free_bytes(&self) -> Result<u64, StoreError> {
+        let path = &self.folder.path;
+        let free = self.folder.volume.free_bytes(path);
+        free.map_err(|error| StoreError::io("read free space", path, error))
+    }
+
+    /// Where the scene will be.
+    pub fn target(&self) -> &Path {
+        &self.target
+    }
+
     /// Points appended so far.
     pub fn point_count(&self) -> u64 {
         self.points.slots()

@@ -23,7 +23,9 @@ pub(super) struct Slot {
 enum State {
     Empty { spawn_at: Instant },
     Taken { worker: Worker },
-    Parked,
+    Parked { since: Instant, reason: String },
+    /// Nobody comes any more.
+    Closed,
 }
 
 struct Worker {
@@ -52,8 +54,22 @@ impl Slot {
         }
     }
 
-    pub(super) fn is_parked(&self) -> bool {
-        matches!(self.state, State::Parked)
+    /// Why the slot is parked, if it is.
+    pub(super) fn parked(&self) -> Option<&str> {
+        match &self.state {
+            State::Parked { reason, .. } => Some(reason),
+            _ => None,
+        }
+    }
+
+    pub(super) fn unpark(&mut self, now: Instant) {
+        if let State::Parked { since, .. } = self.state
+            && now.duration_since(since) >= limits::PARK_WINDOW
+        {
+            self.failures.clear();
+            self.backoff = limits::BACKOFF[0];
+            self.state = State::Empty { spawn_at: now };
+        }
     }
 
     pub(super) fn ready(&mut self, seat: Seat) {
@@ -94,22 +110,22 @@ impl Slot {
                 self.state = State::Taken { worker };
             }
             Err(error) => {
-                let program = plan.worker_binary.display();
-                tracing::error!(slot = seat.slot, %error, %program, "cannot start worker");
-                self.failed(now);
+                let reason = format!("cannot start {}: {error}", plan.worker_binary.display());
+                tracing::error!(slot = seat.slot, reason, "no worker");
+                self.failed(now, reason);
             }
         }
     }
 
     /// A worker died before it was ready, or could not be made.
-    fn failed(&mut self, now: Instant) {
+    fn failed(&mut self, now: Instant, reason: String) {
         self.failures.push_back(now);
         while self.failures.front().is_some_and(|&first| now.duration_since(first) > limits::PARK_WINDOW) {
             self.failures.pop_front();
         }
         if self.failures.len() >= limits::PARK_DEATHS {
             tracing::error!(slot = self.number, deaths = self.failures.len(), "slot parked");
-            self.state = State::Parked;
+            self.state = State::Parked { since: now, reason };
             return;
         }
         self.state = State::Empty {
@@ -139,7 +155,7 @@ impl Slot {
         tracing::warn!(slot = worker.seat.slot, epoch = worker.seat.epoch, status, ?death, "worker died");
         nursery.dead(worker.seat, death);
         if !worker.ready {
-            self.failed(now);
+            self.failed(now, format!("the worker ended before it was ready: {status}"));
         }
     }
 
@@ -151,7 +167,7 @@ impl Slot {
             let status = worker.child.wait().ok();
             self.buried(nursery, status, Instant::now());
         }
-        self.state = State::Parked;
+        self.state = State::Closed;
     }
 }
 

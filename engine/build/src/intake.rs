@@ -1,0 +1,243 @@
+//! The first stage: every point is taken from the input, looked at once, and given to the sorter.
+
+use crate::error::BuildError;
+use crate::report::{BuildProgress, Stage, StageSeconds};
+use crate::sort::sorter::Sorter;
+use pbgi_core::limits::HALF_MAX;
+use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream, Quantizer};
+use std::ops::ControlFlow;
+use std::time::Instant;
+
+/// Carries progress to the observer, and its wish to stop back.
+pub(crate) struct Watcher<'a>(pub(crate) &'a mut dyn FnMut(BuildProgress) -> ControlFlow<()>);
+
+impl Watcher<'_> {
+    pub(crate) fn tell(&mut self, stage: Stage, done: u64, total: Option<u64>) -> Result<(), BuildError> {
+        match (self.0)(BuildProgress { stage, done, total }) {
+            ControlFlow::Continue(()) => Ok(()),
+            ControlFlow::Break(()) => Err(BuildError::Cancelled),
+        }
+    }
+}
+
+/// What one look at every point tells.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Tally {
+    pub(crate) points: u64,
+    /// Tight box around the valid points.
+    pub(crate) bounds: Bounds,
+    pub(crate) radius_max: f32,
+    pub(crate) radiance_clamped: u64,
+    outside: Option<Misfits<[f32; 3]>>,
+    invalid: Option<Misfits<InvalidPoint>>,
+}
+
+/// Points that cannot be used: how many, and what the first one is like.
+#[derive(Clone, Copy, Debug)]
+struct Misfits<T> {
+    count: u64,
+    first: u64,
+    example: T,
+}
+
+impl<T> Misfits<T> {
+    #[cold]
+    fn count(misfits: &mut Option<Self>, index: u64, example: T) {
+        let entry = misfits.get_or_insert(Self {
+            count: 0,
+            first: index,
+            example,
+        });
+        entry.count += 1;
+    }
+}
+
+impl Default for Tally {
+    fn default() -> Self {
+        Self {
+            points: 0,
+            bounds: Bounds::EMPTY,
+            radius_max: 0.0,
+            radiance_clamped: 0,
+            outside: None,
+            invalid: None,
+        }
+    }
+}
+
+impl Tally {
+    /// Looks at the next point; whether it may be used.
+    #[inline]
+    fn add(&mut self, point: &PointRecord, declared: Option<&Bounds>) -> bool {
+        let index = self.points;
+        self.points += 1;
+        if let Err(reason) = point.validate() {
+            Misfits::count(&mut self.invalid, index, reason);
+            return false;
+        }
+        if declared.is_some_and(|bounds| !bounds.contains(point.position)) {
+            Misfits::count(&mut self.outside, index, point.position);
+            return false;
+        }
+        self.bounds.include(point.position);
+        self.radius_max = self.radius_max.max(point.radius);
+        let mut radiance = point.front_radiance.iter().chain(&point.back_radiance);
+        self.radiance_clamped += u64::from(radiance.any(|value| value.to_f32() >= HALF_MAX));
+        true
+    }
+
+    fn check(&self) -> Result<(), BuildError> {
+        if let Some(Misfits { count, first, example }) = self.invalid {
+            return Err(BuildError::InvalidPoints {
+                count,
+                first,
+                reason: example,
+            });
+        }
+        if let Some(Misfits { count, first, example }) = self.outside {
+            return Err(BuildError::OutsideBounds {
+                count,
+                first,
+                position: example,
+            });
+        }
+        Ok(())
+    }
+}
+
+/// All points, in the sorter.
+pub(crate) struct Intake {
+    pub(crate) tally: Tally,
+    /// `None` if there are no points.
+    pub(crate) quantizer: Option<Quantizer>,
+    /// Reading and sorting so far.
+    pub(crate) seconds: StageSeconds,
+}
+
+/// Takes everything from `stream`. Where it does not know its bounds and the points do not fit the memory, it is read twice:
+/// runs need the lattice.
+pub(crate) fn take_in<S: PointStream + ?Sized>(
+    stream: &mut S,
+    sorter: &mut Sorter,
+    records_max: u64,
+    watcher: &mut Watcher<'_>,
+) -> Result<Intake, BuildError<S::Error>> {
+    let declared = stream.bounds();
+    if let Some(Bounds { min, max }) = declared.filter(|bounds| !bounds.is_empty() && lattice(bounds).is_none()) {
+        return Err(BuildError::Bounds { min, max });
+    }
+    let mut pass = Pass {
+        declared,
+        quantizer: declared.as_ref().and_then(lattice),
+        keeps: true,
+        tally: Tally::default(),
+        seconds: StageSeconds::default(),
+        records_max,
+    };
+    pass.run(stream, sorter, watcher)?;
+    if !pass.keeps {
+        let measured = pass.tally.bounds;
+        pass = Pass {
+            declared: Some(measured),
+            quantizer: lattice(&measured),
+            keeps: true,
+            tally: Tally::default(),
+            ..pass
+        };
+        stream.rewind().map_err(BuildError::Input)?;
+        pass.run(stream, sorter, watcher)?;
+    }
+    Ok(Intake {
+        quantizer: pass.quantizer.or_else(|| lattice(&pass.tally.bounds)),
+        tally: pass.tally,
+        seconds: pass.seconds,
+    })
+}
+
+fn lattice(bounds: &Bounds) -> Option<Quantizer> {
+    Quantizer::from_bounds(bounds)
+}
+
+/// One reading of the input from its start.
+struct Pass {
+    declared: Option<Bounds>,
+    quantizer: Option<Quantizer>,
+    /// Whether points are kept: no longer, once they do not fit and there is no lattice to sort them by.
+    keeps: bool,
+    tally: Tally,
+    seconds: StageSeconds,
+    records_max: u64,
+}
+
+impl Pass {
+    fn run<S: PointStream + ?Sized>(
+        &mut self,
+        stream: &mut S,
+        sorter: &mut Sorter,
+        watcher: &mut Watcher<'_>,
+    ) -> Result<(), BuildError<S::Error>> {
+        let total = stream.len_hint();
+        let mut batch = Vec::new();
+        loop {
+            let started = Instant::now();
+            batch.clear();
+            let more = stream.next_batch(&mut batch).map_err(BuildError::Input)?;
+            self.take(&batch, total, sorter, watcher).map_err(BuildError::widen)?;
+            self.seconds.reading += started.elapsed().as_secs_f64();
+            let told = watcher.tell(Stage::Reading, self.tally.points, total);
+            told.map_err(BuildError::widen)?;
+            if !more {
+                return self.tally.check().map_err(BuildError::widen);
+            }
+        }
+    }
+
+    fn take(
+        &mut self,
+        batch: &[PointRecord],
+        total: Option<u64>,
+        sorter: &mut Sorter,
+        watcher: &mut Watcher<'_>,
+    ) -> Result<(), BuildError> {
+        for point in batch {
+            if self.tally.points == self.records_max {
+                return Err(BuildError::Limit {
+                    what: "points",
+                    max: self.records_max,
+                });
+            }
+            if !self.tally.add(point, self.declared.as_ref()) || !self.keeps {
+                continue;
+            }
+            if sorter.buffer().is_full() {
+                self.make_room(total, sorter, watcher)?;
+            }
+            if self.keeps {
+                sorter.buffer().push(*point);
+            }
+        }
+        Ok(())
+    }
+
+    #[cold]
+    fn make_room(
+        &mut self,
+        total: Option<u64>,
+        sorter: &mut Sorter,
+        watcher: &mut Watcher<'_>,
+    ) -> Result<(), BuildError> {
+        let Some(quantizer) = &self.quantizer else {
+            sorter.buffer().clear();
+            self.keeps = false;
+            return Ok(());
+        };
+        let started = Instant::now();
+        let points = self.tally.points;
+        sorter.spill(quantizer, total, &mut |_| watcher.tell(Stage::Sorting, points, total))?;
+        let seconds = started.elapsed().as_secs_f64();
+        self.seconds.sorting += seconds;
+        // The caller's clock runs on.
+        self.seconds.reading -= seconds;
+        Ok(())
+    }
+}

@@ -1,0 +1,144 @@
+//! [`Merge`]: many sorted runs read as one, through a tree of losers (Knuth, volume 3, section 5.4.1).
+
+use crate::limits::BATCH_POINTS;
+use crate::sort::{SortedBatch, SortedPoints};
+use pbgi_core::{PointRecord, Quantizer};
+use pbgi_store::{Run, RunReader, StoreError};
+
+/// Behind every code of 63 bits: the key of a run that has ended.
+const ENDED: u64 = u64::MAX;
+
+/// Merges runs. Runs must be given in the order of their input: of equal codes, that of the earlier run comes first.
+pub struct Merge {
+    runs: Vec<Cursor>,
+    /// Code of the next point of each run, apart from the runs so that comparing touches little memory.
+    codes: Vec<u64>,
+    /// `losers[i]`, i >= 1: the run that lost the comparison at inner node i; its children are nodes 2 i and 2 i + 1, node
+    /// `runs + r` is the leaf of run r.
+    losers: Vec<usize>,
+    winner: usize,
+    quantizer: Quantizer,
+}
+
+/// A run and the part of it in memory. The reader goes, and with it the file, as soon as the run has ended.
+struct Cursor {
+    reader: Option<RunReader>,
+    buffer: Vec<PointRecord>,
+    next: usize,
+}
+
+impl Cursor {
+    /// Makes sure that `buffer[next]` is the next point; `None` at the end.
+    fn front(&mut self) -> Result<Option<&PointRecord>, StoreError> {
+        if self.next == self.buffer.len()
+            && let Some(reader) = &mut self.reader
+        {
+            self.next = 0;
+            reader.next_records(&mut self.buffer)?;
+            if self.buffer.is_empty() {
+                self.reader = None;
+                self.buffer = Vec::new();
+            }
+        }
+        Ok(self.buffer.get(self.next))
+    }
+}
+
+impl Merge {
+    /// Starts reading all runs, `blocks_per_read` blocks of each at a time.
+    ///
+    /// # Errors
+    /// Scratch cannot be read.
+    pub fn new(runs: Vec<Run>, blocks_per_read: usize, quantizer: Quantizer) -> Result<Self, StoreError> {
+        let mut merge = Self {
+            codes: vec![ENDED; runs.len()],
+            losers: vec![0; runs.len()],
+            winner: 0,
+            runs: Vec::with_capacity(runs.len()),
+            quantizer,
+        };
+        for (index, run) in runs.into_iter().enumerate() {
+            merge.runs.push(Cursor {
+                reader: Some(RunReader::new(run, blocks_per_read)),
+                buffer: Vec::new(),
+                next: 0,
+            });
+            merge.load_code(index)?;
+        }
+        merge.play_all();
+        Ok(merge)
+    }
+
+    /// The next point and its code; `None` at the end.
+    ///
+    /// # Errors
+    /// Scratch cannot be read.
+    #[inline]
+    pub fn next_point(&mut self) -> Result<Option<(u64, PointRecord)>, StoreError> {
+        let run = self.winner;
+        let code = self.codes.get(run).copied().unwrap_or(ENDED);
+        if code == ENDED {
+            return Ok(None);
+        }
+        let cursor = &mut self.runs[run];
+        let point = cursor.buffer[cursor.next];
+        cursor.next += 1;
+        self.load_code(run)?;
+        self.replay(run);
+        Ok(Some((code, point)))
+    }
+
+    #[inline]
+    fn load_code(&mut self, run: usize) -> Result<(), StoreError> {
+        let front = self.runs[run].front()?;
+        self.codes[run] = front.map_or(ENDED, |point| self.quantizer.code(point.position).0);
+        Ok(())
+    }
+
+    #[inline]
+    fn before(&self, a: usize, b: usize) -> bool {
+        (self.codes[a], a) < (self.codes[b], b)
+    }
+
+    /// Plays every match, from the leaves up.
+    fn play_all(&mut self) {
+        let count = self.runs.len();
+        let mut winners = vec![0; 2 * count];
+        for run in 0..count {
+            winners[count + run] = run;
+        }
+        for node in (1..count).rev() {
+            let (a, b) = (winners[2 * node], winners[2 * node + 1]);
+            (winners[node], self.losers[node]) = if self.before(a, b) { (a, b) } else { (b, a) };
+        }
+        self.winner = winners.get(1).copied().unwrap_or(0);
+    }
+
+    /// Plays again the matches between the leaf of `run` and the root.
+    #[inline]
+    fn replay(&mut self, run: usize) {
+        let mut winner = run;
+        let mut node = (self.runs.len() + run) / 2;
+        while node > 0 {
+            let loser = self.losers[node];
+            if self.before(loser, winner) {
+                self.losers[node] = winner;
+                winner = loser;
+            }
+            node /= 2;
+        }
+        self.winner = winner;
+    }
+}
+
+impl SortedPoints for Merge {
+    fn next_sorted(&mut self, batch: &mut SortedBatch) -> Result<(), StoreError> {
+        batch.clear();
+        while batch.codes.len() < BATCH_POINTS
+            && let Some((code, point)) = self.next_point()?
+        {
+            batch.push(code, point);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,184 @@
+//! The build child: reads a spec on standard input, builds, and tells how it goes on standard output, a JSON object a line.
+
+use crate::job::Density;
+use crate::limits;
+use nix::sys::prctl::set_pdeathsig;
+use nix::sys::resource::{Resource, setrlimit};
+use nix::sys::signal::{SigSet, Signal};
+use pbgi_build::{BuildProgress, BuildReport, BuildRequest, build};
+use pbgi_core::{BuildSettings, Statistics};
+use pbgi_points::SampleOptions;
+use pbgi_store::Overwrite;
+use serde::{Deserialize, Serialize};
+use std::io::{self, Read, Write};
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Everything the child must know.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Spec {
+    /// Points or meshes.
+    pub inputs: Vec<PathBuf>,
+    /// The scene directory.
+    pub output: PathBuf,
+    /// Whether one that is there is replaced.
+    pub overwrite: bool,
+    /// How.
+    pub settings: BuildSettings,
+    /// For meshes.
+    pub density: Density,
+    /// Where runs go.
+    pub scratch_dir: PathBuf,
+    /// The build's own limit.
+    pub memory_bytes: u64,
+    /// The limit that the system enforces.
+    pub data_limit_bytes: u64,
+    /// Who started this; the child ends with it.
+    pub daemon_pid: u32,
+}
+
+/// A line of the child.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Report {
+    /// How far it is.
+    Progress {
+        /// What it is doing.
+        stage: String,
+        /// Points done.
+        done: u64,
+        /// Points in all, 0 while unknown.
+        total: u64,
+    },
+    /// The scene is there.
+    Done {
+        /// What it took.
+        statistics: Box<Statistics>,
+    },
+    /// It will not be.
+    Failed {
+        /// Why.
+        error: String,
+    },
+}
+
+/// Time between two progress lines.
+const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Runs the child's part; `true` if the scene was built.
+pub fn run() -> bool {
+    let outcome = read_spec().and_then(|spec| {
+        obey_the_daemon(&spec)?;
+        build_scene(&spec)
+    });
+    let (report, built) = match outcome {
+        Ok(report) => {
+            let statistics = Box::new(statistics(&report));
+            (Report::Done { statistics }, true)
+        }
+        Err(error) => (Report::Failed { error }, false),
+    };
+    say(&report) && built
+}
+
+fn read_spec() -> Result<Spec, String> {
+    let mut text = String::new();
+    let read = io::stdin().take(limits::SPEC_BYTES_MAX).read_to_string(&mut text);
+    read.map_err(|error| format!("cannot read the build spec: {error}"))?;
+    serde_json::from_str(&text).map_err(|error| format!("cannot understand the build spec: {error}"))
+}
+
+/// Dies with the daemon, stays within the limit.
+fn obey_the_daemon(spec: &Spec) -> Result<(), String> {
+    let cannot = |what: &str| {
+        let what = what.to_owned();
+        move |errno: nix::errno::Errno| format!("cannot {what}: {errno}")
+    };
+    set_pdeathsig(Signal::SIGKILL).map_err(cannot("arm the parent-death signal"))?;
+    if nix::unistd::getppid().as_raw() != spec.daemon_pid as i32 {
+        return Err("the daemon is gone".into());
+    }
+    let limit = spec.data_limit_bytes;
+    setrlimit(Resource::RLIMIT_DATA, limit, limit).map_err(cannot("limit the memory"))?;
+    // A crash must not write the user's data to a core file.
+    setrlimit(Resource::RLIMIT_CORE, 0, 0).map_err(cannot("turn off core files"))
+}
+
+fn build_scene(spec: &Spec) -> Result<BuildReport, String> {
+    let cancelled = cancel_flag()?;
+    let default = SampleOptions::default();
+    let options = SampleOptions {
+        density: match spec.density {
+            Density::Default => default.density,
+            Density::Spacing(spacing) => pbgi_points::Density::Spacing(spacing),
+            Density::Points(points) => pbgi_points::Density::Points(points),
+        },
+        ..default
+    };
+    let mut points = pbgi_points::open_input(&spec.inputs, &options).map_err(|error| error.to_string())?;
+    let request = BuildRequest {
+        output: spec.output.clone(),
+        overwrite: if spec.overwrite { Overwrite::Replace } else { Overwrite::Refuse },
+        scratch_dir: spec.scratch_dir.clone(),
+        memory_bytes: spec.memory_bytes,
+        settings: spec.settings,
+    };
+    let mut last = None;
+    let mut observer = |progress: BuildProgress| {
+        let now = Instant::now();
+        let due = last.is_none_or(|(at, stage)| now.duration_since(at) >= PROGRESS_INTERVAL || stage != progress.stage);
+        if due {
+            last = Some((now, progress.stage));
+            // A daemon that does not listen any more is gone, and takes us with it.
+            say(&Report::Progress {
+                stage: progress.stage.name().into(),
+                done: progress.done,
+                total: progress.total.unwrap_or(0),
+            });
+        }
+        if cancelled.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    };
+    build(&mut points, &request, &mut observer).map_err(|error| error.to_string())
+}
+
+/// Set by SIGTERM. The signal is blocked in every thread and waited for in one, which needs no handler.
+fn cancel_flag() -> Result<Arc<AtomicBool>, String> {
+    let mut signals = SigSet::empty();
+    signals.add(Signal::SIGTERM);
+    signals.thread_block().map_err(|errno| format!("cannot block SIGTERM: {errno}"))?;
+    let flag = Arc::new(AtomicBool::new(false));
+    let set = flag.clone();
+    let wait = move || {
+        if signals.wait().is_ok() {
+            set.store(true, Ordering::Relaxed);
+        }
+    };
+    let thread = std::thread::Builder::new().name("signals".into()).spawn(wait);
+    thread.map_err(|error| format!("cannot start a thread: {error}"))?;
+    Ok(flag)
+}
+
+fn statistics(report: &BuildReport) -> Statistics {
+    let count = |value: u64| Some(value as f64);
+    Statistics {
+        points: count(report.info.point_count),
+        nodes: count(report.info.node_count),
+        sort_seconds: Some(report.sort_seconds),
+        build_seconds: Some(report.build_seconds),
+        out_of_core_bytes: count(report.info.out_of_core_bytes()),
+        bytes_read: count(report.bytes_read),
+        bytes_written: count(report.bytes_written),
+        ..Statistics::default()
+    }
+}
+
+fn say(report: &Report) -> bool {
+    let Ok(mut line) = serde_json::to_vec(report) else { return false };
+    line.push(b'\n');
+    let mut stdout = io::stdout().lock();
+    stdout.write_all(&line).and_then(|()| stdout.flush()).is_ok()
+}

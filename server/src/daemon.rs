@@ -1,0 +1,269 @@
+//! The daemon from its first breath to its last: takes its sockets and its end of life as arguments.
+
+use crate::config::Config;
+use crate::dispatcher::Dispatcher;
+use crate::error::ServerError;
+use crate::limits;
+use crate::loader::{Loader, cache_seat};
+use crate::mounts::Mounts;
+use crate::rpc;
+use crate::scheduler::{Death, Seat};
+use crate::state::StateDir;
+use crate::supervisor::{Handle, Nursery, Plan, Supervisor, WorkerBirth};
+use pbgi_cache::{CacheOwner, Segment};
+use pbgi_store::{OsVolume, sweep_scratch};
+use std::fs;
+use std::io;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+use tokio::net::UnixListener;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+/// The sockets, bound.
+#[derive(Debug)]
+pub struct Listeners {
+    jobs: (UnixListener, PathBuf),
+    queue: (UnixListener, PathBuf),
+}
+
+impl Listeners {
+    /// Binds both sockets of a configuration. Needs a runtime.
+    ///
+    /// # Errors
+    /// A name that is taken by a living daemon, or the system refuses.
+    pub fn bind(config: &Config) -> Result<Self, ServerError> {
+        let bind = |path: PathBuf| Ok::<_, ServerError>((bind(&path)?, path));
+        Ok(Self {
+            jobs: bind(config.options.jobs_socket())?,
+            queue: bind(config.options.queue_socket())?,
+        })
+    }
+}
+
+fn bind(path: &Path) -> Result<UnixListener, ServerError> {
+    match UnixStream::connect(path) {
+        Ok(_) => {
+            return Err(ServerError::Setup {
+                action: "bind a socket",
+                reason: format!("another daemon listens there, at {}", path.display()),
+            });
+        }
+        // Left behind by a daemon that died.
+        Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {
+            fs::remove_file(path).map_err(ServerError::io("remove a stale socket", path))?;
+        }
+        Err(_) => {}
+    }
+    UnixListener::bind(path).map_err(ServerError::io("bind a socket", path))
+}
+
+/// How far the daemon is told to stop.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Stop {
+    /// Not at all.
+    #[default]
+    Run,
+    /// Finish what is leased, then end.
+    Drain,
+    /// End at once.
+    Now,
+}
+
+/// Runs until told to stop, idle for too long, or broken. `ready` is called when both sockets are served and the segment is
+/// reserved.
+///
+/// # Errors
+/// What kept it from starting.
+pub async fn run(
+    config: Config,
+    state: StateDir,
+    listeners: Listeners,
+    ready: impl FnOnce(),
+    mut stop: watch::Receiver<Stop>,
+) -> Result<(), ServerError> {
+    let paths = [listeners.jobs.1.clone(), listeners.queue.1.clone()];
+    let outcome = run_daemon(&config, &state, listeners, ready, &mut stop).await;
+    for path in paths {
+        // A stale socket is removed by the next start as well.
+        let _ = fs::remove_file(path);
+    }
+    outcome
+}
+
+async fn run_daemon(
+    config: &Config,
+    state: &StateDir,
+    listeners: Listeners,
+    ready: impl FnOnce(),
+    stop: &mut watch::Receiver<Stop>,
+) -> Result<(), ServerError> {
+    sweep(config, state)?;
+    let name = Segment::unique_name()?;
+    state.note_segment(&name)?;
+    let segment = Segment::create(&name, &config.layout).inspect_err(|_| state.forget_segment())?;
+    let cache = Arc::new(CacheOwner::new(segment));
+    let (dispatcher, supervisor) = start(config, cache)?;
+    let (ending, ended) = watch::channel(false);
+    let servers = [
+        tokio::spawn(rpc::serve_jobs(listeners.jobs.0, dispatcher.clone(), ended.clone())),
+        tokio::spawn(rpc::serve_queue(listeners.queue.0, dispatcher.clone(), ended)),
+    ];
+    tracing::info!(
+        version = env!("CARGO_PKG_VERSION"),
+        pid = std::process::id(),
+        memory_bytes = config.memory.total_bytes,
+        segment_bytes = config.layout.total_bytes(),
+        workers = config.options.workers,
+        "ready"
+    );
+    ready();
+    serve(config, &dispatcher, stop).await;
+    tracing::info!("stopping");
+    drain(&dispatcher, stop).await;
+    ending.send_replace(true);
+    let reaped = tokio::task::spawn_blocking(move || supervisor.stop()).await;
+    if let Err(error) = reaped {
+        tracing::error!(%error, "stopping the children panicked");
+    }
+    for server in servers {
+        disconnect(server).await;
+    }
+    // Others may still hold the segment's owner for a moment: its name goes now.
+    if let Err(error) = Segment::unlink(&name) {
+        tracing::error!(%error, "cannot remove the segment");
+    }
+    state.forget_segment();
+    tracing::info!("stopped");
+    Ok(())
+}
+
+/// Cleans up after a daemon that died.
+fn sweep(config: &Config, state: &StateDir) -> Result<(), ServerError> {
+    if let Some(name) = state.sweep_segment()? {
+        tracing::warn!(name, "removed the segment of a daemon that died");
+    }
+    let scratch = &config.options.scratch_dir;
+    match sweep_scratch(&OsVolume, scratch) {
+        Ok(swept) if swept.folders > 0 => tracing::warn!(?swept, "removed scratch of a daemon that died"),
+        Ok(_) => {}
+        Err(error) => tracing::warn!(%error, "cannot sweep scratch"),
+    }
+    if let Err(error) = crate::output::sweep(scratch) {
+        tracing::warn!(%error, "cannot sweep scratch");
+    }
+    Ok(())
+}
+
+/// Starts the supervisor and, through it, the workers.
+fn start(config: &Config, cache: Arc<CacheOwner>) -> Result<(Arc<Dispatcher>, Handle), ServerError> {
+    let options = &config.options;
+    let plan = Plan {
+        workers: options.workers as u8,
+        worker_binary: options.worker_binary.clone(),
+        queue_socket: options.queue_socket(),
+        server_binary: options.server_binary.clone(),
+    };
+    let mut made = None;
+    let runtime = tokio::runtime::Handle::current();
+    let (handle, _) = Supervisor::start(plan, |supervisor| {
+        let mounts = Arc::new(Mounts::new(cache.clone()));
+        let dispatcher = Dispatcher::new(config.clone(), cache.clone(), mounts.clone(), supervisor.clone(), runtime);
+        let dispatcher = made.insert(Arc::new(dispatcher)).clone();
+        Nurse(Loader {
+            cache,
+            mounts,
+            supervisor,
+            dispatcher,
+        })
+    })?;
+    match made {
+        Some(dispatcher) => Ok((dispatcher, handle)),
+        None => Err(ServerError::Setup {
+            action: "start the supervisor",
+            reason: "it was not asked for its nursery".into(),
+        }),
+    }
+}
+
+async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, stop: &mut watch::Receiver<Stop>) {
+    /// Ticks between two looks at the segment's name.
+    const SEGMENT_TICKS: u32 = 5;
+    let mut requested = dispatcher.stop_requested();
+    let mut clock = tokio::time::interval(limits::TICK);
+    clock.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut ticks = 0_u32;
+    loop {
+        tokio::select! {
+            _ = clock.tick() => {}
+            _ = stop.wait_for(|stop| *stop >= Stop::Drain) => return,
+            _ = requested.wait_for(|stop| *stop) => return,
+        }
+        dispatcher.tick();
+        ticks = ticks.wrapping_add(1);
+        if ticks.is_multiple_of(SEGMENT_TICKS) {
+            dispatcher.check_segment();
+        }
+        if let (Some(limit), Some(idle)) = (config.options.idle, dispatcher.idle_time())
+            && idle >= limit
+        {
+            tracing::info!(seconds = idle.as_secs(), "idle for long enough");
+            return;
+        }
+    }
+}
+
+/// Lets leased tiles end, but not for ever.
+async fn drain(dispatcher: &Arc<Dispatcher>, stop: &mut watch::Receiver<Stop>) {
+    dispatcher.drain();
+    let deadline = Instant::now() + limits::DRAIN_MAX;
+    let mut clock = tokio::time::interval(limits::TICK / 4);
+    while !dispatcher.is_idle() && Instant::now() < deadline && *stop.borrow() < Stop::Now {
+        clock.tick().await;
+        dispatcher.tick();
+    }
+}
+
+async fn disconnect(mut server: JoinHandle<Result<(), ServerError>>) {
+    match tokio::time::timeout(limits::DISCONNECT_MAX, &mut server).await {
+        Ok(Ok(Ok(()))) => {}
+        Ok(Ok(Err(error))) => tracing::error!(%error, "server failed"),
+        Ok(Err(error)) => tracing::error!(%error, "server panicked"),
+        // Clients that keep their connections are cut off.
+        Err(_) => server.abort(),
+    }
+}
+
+/// What the supervisor tells, passed on to those concerned.
+struct Nurse(Loader);
+
+impl Nursery for Nurse {
+    fn seat(&mut self, slot: u8) -> Seat {
+        // The slots are the cache's own, so there is always a seat.
+        let epoch = self.0.cache.seat(slot).map_or(0, |seat| seat.epoch);
+        Seat { slot, epoch }
+    }
+
+    fn born(&mut self, birth: WorkerBirth, channel: UnixStream) -> Result<(), ServerError> {
+        self.0.dispatcher.worker_born(birth);
+        self.0.serve(&birth, channel)
+    }
+
+    fn dead(&mut self, seat: Seat, death: Death) {
+        // First the pins: a tile that goes out again must find frames to evict.
+        match self.0.cache.seat(seat.slot) {
+            Ok(current) if current == cache_seat(seat) => match self.0.cache.reap(seat.slot) {
+                Ok(pins) => tracing::debug!(slot = seat.slot, epoch = seat.epoch, pins, "seat reaped"),
+                Err(error) => tracing::error!(%error, "cannot reap a seat"),
+            },
+            _ => tracing::error!(slot = seat.slot, epoch = seat.epoch, "a dead worker had no seat"),
+        }
+        self.0.dispatcher.worker_dead(seat, death);
+    }
+
+    fn parked(&mut self, slots: usize, reason: &str) {
+        self.0.dispatcher.workers_parked(slots, reason);
+    }
+}

@@ -1,0 +1,454 @@
+//! Where the scheduler meets the world: holds the jobs, carries out what the scheduler says, and answers workers and clients.
+//!
+//! Everything happens under one lock, briefly: what takes time is spawned. Entry points for workers are here, for clients in
+//! [`clients`], for the daemon's clock in [`upkeep`].
+
+mod clients;
+mod upkeep;
+
+pub use clients::DaemonStatus;
+
+use crate::config::Config;
+use crate::error::{JobError, JobErrorKind};
+use crate::framebuffer::TileReceivers;
+use crate::job::{JobState, JobStatus, Request};
+use crate::limits;
+use crate::mounts::Mounts;
+use crate::scheduler::{Death, Effect, End, Event, JobNo, LeaseId, Scheduler, Seat};
+use crate::shade_job::{self, Counters, Shading};
+use crate::supervisor::{Handle, WorkerBirth};
+use pbgi_cache::CacheOwner;
+use pbgi_core::{Environment, MountId, SceneInfo, ShadeSettings};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::Instant;
+use tokio::sync::{Notify, Semaphore, watch};
+use tracing::{Instrument, Span};
+
+/// The daemon's middle.
+pub struct Dispatcher {
+    pub(crate) config: Config,
+    pub(crate) cache: Arc<CacheOwner>,
+    pub(crate) mounts: Arc<Mounts>,
+    pub(crate) supervisor: Handle,
+    /// Mebibytes of the work share that are free.
+    pub(crate) work_memory: Arc<Semaphore>,
+    /// One picture is read at a time: how large it is shows only then.
+    pub(crate) picture_gate: tokio::sync::Mutex<()>,
+    runtime: tokio::runtime::Handle,
+    /// Rung when a worker that found no tile may ask again.
+    wake: Notify,
+    stop: watch::Sender<bool>,
+    healthy: watch::Sender<bool>,
+    state: Mutex<State>,
+}
+
+struct State {
+    scheduler: Scheduler,
+    jobs: BTreeMap<JobNo, Record>,
+    names: HashMap<String, JobNo>,
+    /// Ended jobs, oldest first.
+    ended: VecDeque<JobNo>,
+    /// Outputs of jobs that have not ended.
+    outputs: HashSet<PathBuf>,
+    seats: Vec<Option<Sitting>>,
+    build_pids: HashMap<JobNo, u32>,
+    number_last: u64,
+    draining: bool,
+    parked: usize,
+    active: Instant,
+}
+
+/// A job, and what it holds while it runs.
+struct Record {
+    request: Arc<Request>,
+    status: watch::Sender<JobStatus>,
+    abort: watch::Sender<bool>,
+    span: Span,
+    shading: Option<Box<Shading>>,
+    memory_peak_bytes: u64,
+    cache_peak_bytes: u64,
+}
+
+/// A worker.
+struct Sitting {
+    birth: WorkerBirth,
+    ready: bool,
+    work: Option<Work>,
+}
+
+/// What a worker works on.
+struct Work {
+    lease: LeaseId,
+    job: JobNo,
+    tile: u32,
+    span: Span,
+}
+
+/// A tile on its way to a worker.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TileLease {
+    /// The lease.
+    pub lease: LeaseId,
+    /// The job.
+    pub job: JobNo,
+    /// The tile.
+    pub tile: u32,
+    /// What is to be shaded.
+    pub receivers: TileReceivers,
+}
+
+/// What comes back for it.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TileOutcome {
+    /// Seven little-endian floats for each receiver.
+    Values {
+        /// The floats.
+        values: Vec<u8>,
+        /// What it took.
+        counters: Counters,
+    },
+    /// Why there are none.
+    Failure(String),
+}
+
+/// What a worker must know of a job.
+#[derive(Clone, Debug)]
+pub struct TaskInfo {
+    /// The scene.
+    pub scene: SceneInfo,
+    /// Its mount.
+    pub mount: MountId,
+    /// How to shade.
+    pub settings: ShadeSettings,
+    /// Light from far away.
+    pub environment: Option<Arc<Environment>>,
+}
+
+impl Dispatcher {
+    /// No jobs yet. `runtime` carries the jobs' tasks.
+    pub fn new(
+        config: Config,
+        cache: Arc<CacheOwner>,
+        mounts: Arc<Mounts>,
+        supervisor: Handle,
+        runtime: tokio::runtime::Handle,
+    ) -> Self {
+        let state = State {
+            scheduler: Scheduler::default(),
+            jobs: BTreeMap::new(),
+            names: HashMap::new(),
+            ended: VecDeque::new(),
+            outputs: HashSet::new(),
+            seats: (0..config.options.workers).map(|_| None).collect(),
+            build_pids: HashMap::new(),
+            number_last: 0,
+            draining: false,
+            parked: 0,
+            active: Instant::now(),
+        };
+        Self {
+            work_memory: Arc::new(Semaphore::new((config.memory.work_bytes >> 20) as usize)),
+            picture_gate: tokio::sync::Mutex::new(()),
+            config,
+            cache,
+            mounts,
+            supervisor,
+            runtime,
+            wake: Notify::new(),
+            stop: watch::Sender::new(false),
+            healthy: watch::Sender::new(true),
+            state: Mutex::new(state),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(|_| {
+            // A panic in the middle of a change: nobody may see what it left. The next start cleans up.
+            tracing::error!("the dispatcher panicked");
+            std::process::abort()
+        })
+    }
+
+    /// Runs an event through the scheduler and carries out what follows. Answers to a worker are returned.
+    fn dispatch(self: &Arc<Self>, state: &mut State, event: Event, result: Option<(Vec<u8>, Counters)>) -> Option<Effect> {
+        let mut result = result;
+        let mut answer = None;
+        for effect in state.scheduler.on(event, Instant::now()) {
+            match effect {
+                Effect::Start(job) => self.start(state, job),
+                Effect::Abort(job) => {
+                    if let Some(record) = state.jobs.get(&job) {
+                        record.abort.send_replace(true);
+                    }
+                }
+                Effect::Accept { job, tile } => {
+                    if let Some((values, counters)) = result.take() {
+                        accept(state, job, tile, &values, &counters);
+                    }
+                    answer = Some(effect);
+                }
+                Effect::Write(job) => self.write(state, job),
+                Effect::Ended { job, end } => self.ended(state, job, end),
+                Effect::Kill(seat) => self.supervisor.kill(seat),
+                Effect::Wake => self.wake.notify_waiters(),
+                Effect::Grant { .. } | Effect::Drop | Effect::Alive => answer = Some(effect),
+            }
+        }
+        answer
+    }
+
+    fn start(self: &Arc<Self>, state: &mut State, job: JobNo) {
+        let Some(record) = state.jobs.get(&job) else { return };
+        record.status.send_modify(|status| {
+            status.state = JobState::Running;
+            status.stage = "reading";
+        });
+        let (request, abort) = (record.request.clone(), record.abort.subscribe());
+        let this = self.clone();
+        let run = async move {
+            match &*request {
+                Request::Build(task) => {
+                    let outcome = crate::builder::run(&this, job, task, abort).await;
+                    this.finished(job, outcome);
+                }
+                Request::Shade(task) => match shade_job::prepare(&this, job, task, abort).await {
+                    Ok(shading) => this.prepared(job, shading),
+                    Err(error) => this.finished(job, Err(error)),
+                },
+            }
+        };
+        self.runtime.spawn(run.instrument(record.span.clone()));
+    }
+
+    fn prepared(self: &Arc<Self>, job: JobNo, shading: Shading) {
+        let mut state = self.lock();
+        let Some(record) = state.jobs.get_mut(&job) else { return };
+        let tiles = shading.frame.tiles();
+        record.status.send_modify(|status| {
+            status.stage = "shading";
+            status.total = tiles.len() as u64;
+        });
+        record.shading = Some(Box::new(shading));
+        self.dispatch(&mut state, Event::Prepared { job, tiles }, None);
+    }
+
+    fn write(self: &Arc<Self>, state: &mut State, job: JobNo) {
+        let Some(record) = state.jobs.get_mut(&job) else { return };
+        let Some(shading) = record.shading.take() else { return };
+        record.status.send_modify(|status| status.stage = "writing");
+        let (request, abort) = (record.request.clone(), record.abort.subscribe());
+        let this = self.clone();
+        let run = async move {
+            let outcome = match &*request {
+                Request::Shade(task) => shade_job::write(&this, job, task, *shading, abort).await,
+                Request::Build(_) => Err("a build has no picture".to_owned()),
+            };
+            this.finished(job, outcome);
+        };
+        self.runtime.spawn(run.instrument(record.span.clone()));
+    }
+
+    fn finished(self: &Arc<Self>, job: JobNo, outcome: Result<pbgi_core::Statistics, String>) {
+        let mut state = self.lock();
+        state.build_pids.remove(&job);
+        if let (Some(record), Ok(statistics)) = (state.jobs.get(&job), &outcome) {
+            record.status.send_modify(|status| status.statistics.update(statistics));
+        }
+        let outcome = outcome.map(|_| ());
+        self.dispatch(&mut state, Event::Finished { job, outcome }, None);
+    }
+
+    fn ended(&self, state: &mut State, job: JobNo, end: End) {
+        self.cache.end_job(job.0);
+        state.active = Instant::now();
+        let Some(record) = state.jobs.get_mut(&job) else { return };
+        record.shading = None;
+        state.outputs.remove(record.request.output());
+        let _entered = record.span.enter();
+        match &end {
+            End::Succeeded => tracing::info!("job succeeded"),
+            End::Cancelled => tracing::info!("job cancelled"),
+            End::Failed(error) => tracing::error!(error, "job failed"),
+        }
+        record.status.send_modify(|status| {
+            status.stage = "";
+            (status.state, status.error) = match end {
+                End::Succeeded => (JobState::Succeeded, String::new()),
+                End::Cancelled => (JobState::Cancelled, String::new()),
+                End::Failed(error) => (JobState::Failed, error),
+            };
+        });
+        state.ended.push_back(job);
+        while state.ended.len() > limits::JOBS_ENDED_MAX {
+            let Some(oldest) = state.ended.pop_front() else { return };
+            if let Some(record) = state.jobs.remove(&oldest) {
+                let name = record.status.borrow().id.clone();
+                state.names.remove(&name);
+            }
+        }
+    }
+
+    /// A worker was started.
+    pub fn worker_born(&self, birth: WorkerBirth) {
+        let mut state = self.lock();
+        if let Some(seat) = state.seats.get_mut(usize::from(birth.seat.slot)) {
+            let (ready, work) = (false, None);
+            *seat = Some(Sitting { birth, ready, work });
+        }
+    }
+
+    /// A worker is dead and waited for.
+    pub fn worker_dead(self: &Arc<Self>, seat: Seat, death: Death) {
+        let mut state = self.lock();
+        if let Some(sitting) = state.seats.get_mut(usize::from(seat.slot))
+            && sitting.as_ref().is_some_and(|sitting| sitting.birth.seat == seat)
+        {
+            *sitting = None;
+        }
+        self.dispatch(&mut state, Event::WorkerGone { seat, death }, None);
+    }
+
+    /// So many slots are parked; without workers no picture can be shaded.
+    pub fn workers_parked(self: &Arc<Self>, slots: usize, reason: &str) {
+        let mut state = self.lock();
+        state.parked = slots;
+        let none_left = slots == state.seats.len();
+        self.healthy.send_replace(!none_left);
+        if none_left {
+            let reason = format!("no worker can be started: {reason}");
+            self.dispatch(&mut state, Event::Workless { reason }, None);
+        }
+    }
+
+    /// Checks who speaks on the queue.
+    ///
+    /// # Errors
+    /// [`JobErrorKind::Unauthenticated`] for anybody but the worker in that seat.
+    pub fn authenticate(&self, seat: Seat, token: &[u8]) -> Result<(), JobError> {
+        let mut state = self.lock();
+        let sitting = state.seats.get_mut(usize::from(seat.slot)).and_then(Option::as_mut);
+        if let Some(sitting) = sitting
+            && sitting.birth.seat == seat
+            && same(token, &sitting.birth.token)
+        {
+            if !sitting.ready {
+                sitting.ready = true;
+                self.supervisor.ready(seat);
+            }
+            return Ok(());
+        }
+        Err(JobError::new(JobErrorKind::Unauthenticated, "not the worker of that seat"))
+    }
+
+    /// A tile for a worker; `None` if there is none for some seconds.
+    pub async fn lease(self: &Arc<Self>, seat: Seat) -> Option<TileLease> {
+        let deadline = tokio::time::Instant::now() + limits::LEASE_WAIT;
+        loop {
+            let mut rung = std::pin::pin!(self.wake.notified());
+            rung.as_mut().enable();
+            if let Some(lease) = self.try_lease(seat) {
+                return Some(lease);
+            }
+            tokio::select! {
+                () = rung => {}
+                () = tokio::time::sleep_until(deadline) => return None,
+            }
+        }
+    }
+
+    fn try_lease(self: &Arc<Self>, seat: Seat) -> Option<TileLease> {
+        let mut state = self.lock();
+        let sits = |sitting: &Sitting| sitting.birth.seat == seat;
+        if !state.seats.get(usize::from(seat.slot))?.as_ref().is_some_and(sits) {
+            return None;
+        }
+        let granted = self.dispatch(&mut state, Event::Ask { seat }, None)?;
+        let Effect::Grant { lease, job, tile, .. } = granted else { return None };
+        let record = state.jobs.get(&job)?;
+        let receivers = record.shading.as_ref()?.frame.receivers(tile);
+        let span = tracing::debug_span!(parent: &record.span, "tile", tile, lease = lease.0, slot = seat.slot, epoch = seat.epoch);
+        let work = Work { lease, job, tile, span };
+        if let Some(sitting) = state.seats.get_mut(usize::from(seat.slot))?.as_mut() {
+            sitting.work = Some(work);
+        }
+        Some(TileLease {
+            lease,
+            job,
+            tile,
+            receivers,
+        })
+    }
+
+    /// A worker shows that it lives; tells whether its lease does.
+    pub fn heartbeat(self: &Arc<Self>, seat: Seat, lease: LeaseId) -> bool {
+        let mut state = self.lock();
+        self.dispatch(&mut state, Event::Heartbeat { seat, lease }, None) == Some(Effect::Alive)
+    }
+
+    /// A worker is done with a tile; tells whether its result was taken.
+    pub fn complete(self: &Arc<Self>, seat: Seat, lease: LeaseId, outcome: TileOutcome) -> bool {
+        let mut state = self.lock();
+        let sitting = state.seats.get_mut(usize::from(seat.slot)).and_then(Option::as_mut);
+        let work = sitting.and_then(|sitting| sitting.work.take_if(|work| work.lease == lease));
+        let (mut failure, mut result) = (None, None);
+        match outcome {
+            TileOutcome::Failure(text) => failure = Some(text),
+            TileOutcome::Values { values, counters } => {
+                let shading = work.as_ref().and_then(|work| state.jobs.get(&work.job)?.shading.as_ref());
+                let checked = match (shading, &work) {
+                    (Some(shading), Some(work)) => shading.frame.check(work.tile, &values),
+                    // The lease ended, as the scheduler knows.
+                    _ => Ok(()),
+                };
+                match checked {
+                    Ok(()) => result = Some((values, counters)),
+                    Err(text) => failure = Some(format!("the worker's answer is wrong: {text}")),
+                }
+            }
+        }
+        let answer = self.dispatch(&mut state, Event::Complete { seat, lease, failure }, result);
+        matches!(answer, Some(Effect::Accept { .. }))
+    }
+
+    /// What a worker must know of a job.
+    ///
+    /// # Errors
+    /// The job is over.
+    pub fn task(&self, job: JobNo) -> Result<TaskInfo, JobError> {
+        let state = self.lock();
+        let record = state.jobs.get(&job);
+        match record.and_then(|record| Some((record.shading.as_ref()?, &*record.request))) {
+            Some((shading, Request::Shade(task))) => Ok(TaskInfo {
+                scene: shading.mounted.scene().info().clone(),
+                mount: shading.mounted.id(),
+                settings: task.settings,
+                environment: shading.environment.clone(),
+            }),
+            _ => Err(JobError::new(JobErrorKind::NotFound, format!("task {} is over", job.0))),
+        }
+    }
+
+    /// The span of the tile that a worker works on, as the parent of its page loads.
+    pub fn tile_span(&self, seat: Seat) -> Span {
+        let state = self.lock();
+        let sitting = state.seats.get(usize::from(seat.slot)).and_then(Option::as_ref);
+        let work = sitting.filter(|sitting| sitting.birth.seat == seat).and_then(|sitting| sitting.work.as_ref());
+        work.map_or_else(Span::none, |work| work.span.clone())
+    }
+}
+
+fn accept(state: &mut State, job: JobNo, tile: u32, values: &[u8], counters: &Counters) {
+    let Some(record) = state.jobs.get_mut(&job) else { return };
+    if let Some(shading) = &mut record.shading {
+        shading.frame.fill(tile, values);
+        shading.counters.add(counters);
+    }
+    record.status.send_modify(|status| status.done += 1);
+}
+
+/// Compares in a time that does not tell where the difference is.
+fn same(given: &[u8], token: &[u8; 16]) -> bool {
+    given.len() == token.len() && given.iter().zip(token).fold(0, |all, (a, b)| all | (a ^ b)) == 0
+}

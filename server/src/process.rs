@@ -1,0 +1,66 @@
+//! What the program does to its own process.
+
+use nix::sys::stat::{Mode, umask};
+use nix::unistd::{close, dup2_stderr, dup2_stdin, dup2_stdout, setsid};
+use pbgi_server::ServerError;
+use std::fs::{self, File, OpenOptions};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+
+/// A log longer than this is put aside when the daemon starts.
+const LOG_BYTES_MAX: u64 = 16 << 20;
+
+/// New session, nothing inherited but the three standard streams. To be called before anything is opened.
+pub(crate) fn leave_the_session() {
+    // Fails only for the leader of a group, which is on its own already.
+    let _ = setsid();
+    let Ok(entries) = fs::read_dir("/proc/self/fd") else { return };
+    let number = |entry: std::io::Result<fs::DirEntry>| entry.ok()?.file_name().to_str()?.parse::<i32>().ok();
+    let inherited: Vec<i32> = entries.filter_map(number).filter(|&descriptor| descriptor > 2).collect();
+    for descriptor in inherited {
+        // The listing's own descriptor is closed by now.
+        let _ = close(descriptor);
+    }
+}
+
+/// Whatever we make is ours alone.
+pub(crate) fn make_files_private() {
+    umask(Mode::from_bits_truncate(0o077));
+}
+
+/// Sends standard error to a file and takes standard input away.
+pub(crate) fn log_to(path: &Path) -> Result<(), ServerError> {
+    let io = |source| ServerError::Io {
+        action: "open log",
+        path: path.to_owned(),
+        source,
+    };
+    if fs::metadata(path).is_ok_and(|metadata| metadata.len() > LOG_BYTES_MAX) {
+        fs::rename(path, path.with_extension("log.1")).map_err(io)?;
+    }
+    let log = OpenOptions::new().create(true).append(true).mode(0o600).open(path).map_err(io)?;
+    dup2_stderr(&log).map_err(|errno| io(errno.into()))?;
+    let null = File::open("/dev/null").map_err(io)?;
+    dup2_stdin(&null).map_err(|errno| io(errno.into()))
+}
+
+/// Lets whoever started us see the end of our output.
+pub(crate) fn detach_stdout() {
+    let null = OpenOptions::new().write(true).open("/dev/null");
+    if let Err(error) = null.and_then(|null| Ok(dup2_stdout(&null)?)) {
+        tracing::warn!(%error, "cannot detach standard output");
+    }
+}
+
+/// A panic in the threads that everything rests on ends the process: a supervisor starts it anew, the next start cleans up.
+pub(crate) fn abort_on_core_panic() {
+    let report = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        report(info);
+        let thread = std::thread::current();
+        let name = thread.name().unwrap_or_default();
+        if name == "supervisor" || name.starts_with("loader-") {
+            std::process::abort();
+        }
+    }));
+}

@@ -1,0 +1,174 @@
+//! Wire types to ours, and back. What a client left unset takes the default here.
+
+use crate::dispatcher::{DaemonStatus, TaskInfo};
+use crate::error::JobError;
+use crate::job::{BuildTask, Density, JobState, JobStatus, Request, ShadeTask};
+use crate::shade_job::Counters;
+use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
+use pbgi_proto::v1;
+
+pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Request, JobError> {
+    match task {
+        Some(v1::submit_job_request::Task::Build(task)) => Ok(Request::Build(BuildTask {
+            inputs: task.inputs.into_iter().map(Into::into).collect(),
+            output: task.output.into(),
+            overwrite: task.overwrite,
+            settings: build_settings(task.settings),
+            density: match task.density {
+                None => Density::Default,
+                Some(v1::build_task::Density::Spacing(spacing)) => Density::Spacing(spacing),
+                Some(v1::build_task::Density::Points(points)) => Density::Points(points),
+            },
+        })),
+        Some(v1::submit_job_request::Task::Shade(task)) => Ok(Request::Shade(ShadeTask {
+            scene: task.scene.into(),
+            gbuffer: task.gbuffer.into(),
+            output: task.output.into(),
+            overwrite: task.overwrite,
+            settings: shade_settings(task.settings),
+            environment: (!task.environment.is_empty()).then(|| task.environment.into()),
+            workers: (task.workers > 0).then_some(task.workers as usize),
+        })),
+        None => Err(JobError::invalid("the request has no task")),
+    }
+}
+
+fn build_settings(settings: Option<v1::BuildSettings>) -> BuildSettings {
+    let (given, default) = (settings.unwrap_or_default(), BuildSettings::default());
+    BuildSettings {
+        leaf_max: given.leaf_max.unwrap_or(default.leaf_max),
+        chunk_levels: given.chunk_levels.unwrap_or(default.chunk_levels),
+        nodes_per_page: given.nodes_per_page.unwrap_or(default.nodes_per_page),
+        points_per_page: given.points_per_page.unwrap_or(default.points_per_page),
+    }
+}
+
+fn shade_settings(settings: Option<v1::ShadeSettings>) -> ShadeSettings {
+    let (given, default) = (settings.unwrap_or_default(), ShadeSettings::default());
+    ShadeSettings {
+        max_solid_angle: given.max_solid_angle.unwrap_or(default.max_solid_angle),
+        raster_resolution: given.raster_resolution.unwrap_or(default.raster_resolution),
+        max_dist: given.max_dist.unwrap_or(default.max_dist),
+        falloff: given.falloff.unwrap_or(default.falloff),
+        bias: given.bias.unwrap_or(default.bias),
+    }
+}
+
+pub(super) fn job(status: JobStatus) -> v1::Job {
+    let state = match status.state {
+        JobState::Queued => v1::JobState::Queued,
+        JobState::Running => v1::JobState::Running,
+        JobState::Succeeded => v1::JobState::Succeeded,
+        JobState::Failed => v1::JobState::Failed,
+        JobState::Cancelled => v1::JobState::Cancelled,
+    };
+    v1::Job {
+        job_id: status.id,
+        state: state.into(),
+        stage: status.stage.into(),
+        done: status.done,
+        total: status.total,
+        error: status.error,
+        statistics: Some(statistics(&status.statistics)),
+        title: status.title,
+    }
+}
+
+fn statistics(statistics: &Statistics) -> v1::Statistics {
+    let rows = statistics.rows().into_iter();
+    v1::Statistics {
+        rows: rows.filter_map(|row| Some((row.name.to_owned(), row.value?))).collect(),
+    }
+}
+
+pub(super) fn scene(info: &SceneInfo) -> v1::SceneInfo {
+    let bounds = |bounds: &Bounds| v1::Bounds {
+        min: bounds.min.to_vec(),
+        max: bounds.max.to_vec(),
+    };
+    v1::SceneInfo {
+        build_id: info.build_id.to_string(),
+        point_count: info.point_count,
+        node_count: info.node_count,
+        node_slots: info.node_slots,
+        root: info.root.map(|root| root.0),
+        bounds: info.bounds.as_ref().map(bounds),
+        lattice: info.quantizer.as_ref().map_or_else(Vec::new, |quantizer| {
+            let [x, y, z] = quantizer.origin;
+            vec![x, y, z, quantizer.edge]
+        }),
+        radius_max: info.radius_max,
+        settings: Some(v1::BuildSettings {
+            leaf_max: Some(info.settings.leaf_max),
+            chunk_levels: Some(info.settings.chunk_levels),
+            nodes_per_page: Some(info.settings.nodes_per_page),
+            points_per_page: Some(info.settings.points_per_page),
+        }),
+    }
+}
+
+pub(super) fn task(task: &TaskInfo) -> v1::Task {
+    let settings = &task.settings;
+    let pixels = task.environment.iter().flat_map(|environment| environment.pixels()).flatten();
+    v1::Task {
+        scene: Some(scene(&task.scene)),
+        mount_slot: task.mount.slot.into(),
+        mount_generation: task.mount.generation.into(),
+        settings: Some(v1::ShadeSettings {
+            max_solid_angle: Some(settings.max_solid_angle),
+            raster_resolution: Some(settings.raster_resolution),
+            max_dist: Some(settings.max_dist),
+            falloff: Some(settings.falloff),
+            bias: Some(settings.bias),
+        }),
+        environment_width: task.environment.as_ref().map_or(0, |environment| environment.width()),
+        environment_height: task.environment.as_ref().map_or(0, |environment| environment.height()),
+        environment: pixels.flat_map(|value| value.to_le_bytes()).collect(),
+    }
+}
+
+pub(super) fn counters(counters: Option<v1::TileCounters>) -> Counters {
+    let given = counters.unwrap_or_default();
+    Counters {
+        receivers: given.receivers,
+        cut_elements: given.cut_elements,
+        nodes_visited: given.nodes_visited,
+        traversal_bytes: given.traversal_bytes,
+        local_hits: given.local_hits,
+        shared_hits: given.shared_hits,
+        shared_hits_other_job: given.shared_hits_other_job,
+        cache_misses: given.cache_misses,
+        cpu_nanos: given.cpu_nanos,
+        io_nanos: given.io_nanos,
+    }
+}
+
+pub(super) fn daemon(status: DaemonStatus) -> v1::DaemonStatus {
+    let small = |value: u64| u32::try_from(value).unwrap_or(u32::MAX);
+    let workers = status.workers.into_iter().map(|(birth, busy, frames_pinned)| v1::WorkerStatus {
+        slot: birth.seat.slot.into(),
+        epoch: birth.seat.epoch,
+        pid: birth.pid,
+        busy,
+        frames_pinned,
+    });
+    let mounts = status.mounts.into_iter().map(|mount| v1::MountStatus {
+        scene: mount.path.to_string_lossy().into_owned(),
+        build_id: mount.build_id.to_string(),
+        pages_loaded: mount.pages_loaded,
+    });
+    v1::DaemonStatus {
+        version: env!("CARGO_PKG_VERSION").into(),
+        pid: std::process::id(),
+        memory_bytes: status.memory_bytes,
+        segment_bytes: status.segment_bytes,
+        node_frames: small(status.cache.node.frames),
+        node_frames_resident: small(status.cache.node.resident),
+        point_frames: small(status.cache.point.frames),
+        point_frames_resident: small(status.cache.point.resident),
+        workers: workers.collect(),
+        mounts: mounts.collect(),
+        jobs_queued: small(status.jobs_queued as u64),
+        jobs_running: small(status.jobs_running as u64),
+    }
+}

@@ -1,0 +1,110 @@
+//! Real processes of the system's own programs in place of workers.
+
+use super::*;
+use std::collections::HashMap;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+#[derive(Default)]
+struct Log {
+    epochs: HashMap<u8, u32>,
+    births: Vec<(WorkerBirth, UnixStream)>,
+    deaths: Vec<(Seat, Death)>,
+    parked: Option<(usize, String)>,
+}
+
+#[derive(Clone, Default)]
+struct Witness(Arc<Mutex<Log>>);
+
+impl Nursery for Witness {
+    fn seat(&mut self, slot: u8) -> Seat {
+        let epoch = *self.0.lock().unwrap().epochs.entry(slot).or_insert(1);
+        Seat { slot, epoch }
+    }
+
+    fn born(&mut self, birth: WorkerBirth, channel: UnixStream) -> Result<(), ServerError> {
+        self.0.lock().unwrap().births.push((birth, channel));
+        Ok(())
+    }
+
+    fn dead(&mut self, seat: Seat, death: Death) {
+        let mut log = self.0.lock().unwrap();
+        *log.epochs.entry(seat.slot).or_insert(1) += 1;
+        log.deaths.push((seat, death));
+    }
+
+    fn parked(&mut self, slots: usize, reason: &str) {
+        self.0.lock().unwrap().parked = Some((slots, reason.to_owned()));
+    }
+}
+
+fn start(worker: &Path, workers: u8) -> (Handle, Witness) {
+    let plan = Plan {
+        workers,
+        worker_binary: worker.to_owned(),
+        queue_socket: "/nowhere".into(),
+        server_binary: "/bin/cat".into(),
+    };
+    let witness = Witness::default();
+    let (handle, _) = Supervisor::start(plan, |_| witness.clone()).unwrap();
+    (handle, witness)
+}
+
+/// A program that sleeps whatever its arguments are.
+fn sleeper(folder: &Path) -> PathBuf {
+    let path = folder.join("sleeper");
+    std::fs::write(&path, "#!/bin/sh\nexec sleep 1000\n").unwrap();
+    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).unwrap();
+    path
+}
+
+fn wait<T>(witness: &Witness, what: &str, mut found: impl FnMut(&mut Log) -> Option<T>) -> T {
+    let deadline = Instant::now() + Duration::from_secs(20);
+    loop {
+        if let Some(value) = found(&mut witness.0.lock().unwrap()) {
+            return value;
+        }
+        assert!(Instant::now() < deadline, "no {what} within 20 s");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn dead_worker_is_reaped_and_its_slot_filled_with_a_new_epoch() {
+    let folder = tempfile::tempdir().unwrap();
+    let (handle, witness) = start(&sleeper(folder.path()), 2);
+    let births = wait(&witness, "births", |log| (log.births.len() == 2).then(|| log.births[0].0));
+    handle.ready(births.seat);
+    handle.kill(births.seat);
+    let (seat, death) = wait(&witness, "death", |log| log.deaths.first().copied());
+    assert_eq!((seat, death), (births.seat, Death::Killed));
+    let third = wait(&witness, "third birth", |log| log.births.get(2).map(|birth| birth.0));
+    assert_eq!(third.seat, Seat { slot: seat.slot, epoch: 2 });
+    assert_ne!(third.token, births.token);
+    // A kill meant for the old worker does not hit the new one.
+    handle.kill(births.seat);
+    handle.stop();
+    let deaths = wait(&witness, "deaths", |log| (log.deaths.len() == 3).then(|| log.deaths.clone()));
+    assert!(deaths.contains(&(third.seat, Death::Killed)), "{deaths:?}");
+    let pids: Vec<u32> = witness.0.lock().unwrap().births.iter().map(|birth| birth.0.pid).collect();
+    assert!(pids.iter().all(|pid| crate::memory::anonymous_bytes(*pid).is_none()), "a child is left");
+}
+
+#[test]
+fn workers_that_never_get_ready_park_their_slot_after_five_deaths() {
+    let (handle, witness) = start(Path::new("/bin/false"), 1);
+    let (slots, reason) = wait(&witness, "parking", |log| log.parked.clone());
+    assert_eq!(slots, 1);
+    assert!(reason.contains("before it was ready: exit status: 1"), "{reason}");
+    assert_eq!(witness.0.lock().unwrap().deaths.len(), limits::PARK_DEATHS);
+    handle.stop();
+}
+
+#[test]
+fn missing_worker_program_is_named() {
+    let (handle, witness) = start(Path::new("/nowhere/worker"), 1);
+    let (_, reason) = wait(&witness, "parking", |log| log.parked.clone());
+    assert!(reason.contains("cannot start /nowhere/worker: No such file"), "{reason}");
+    handle.stop();
+}
