@@ -1,4 +1,5 @@
 //! The program as people meet it: what they get wrong is named, with the remedy, and nothing is left behind.
+#![allow(clippy::unwrap_used, reason = "tests assert")]
 
 use std::path::Path;
 use std::process::{Command, Output};
