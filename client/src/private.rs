@@ -21,9 +21,11 @@ const SOCKET_PATH_MAX: usize = 107;
 const START_TIMEOUT: Duration = Duration::from_secs(60);
 /// Between two looks at a lock that another client holds.
 const LOCK_POLL: Duration = Duration::from_millis(50);
-/// A daemon that is going away holds its folders for a moment.
+/// A daemon that is going away holds its folders until what is leased is finished, for half a minute at most.
+const LEAVE_TIMEOUT: Duration = Duration::from_secs(40);
 const RETRY_WAIT: Duration = Duration::from_millis(300);
-const ATTEMPTS: u32 = 5;
+/// What a daemon says whose state folder is held.
+const IN_USE: &str = "already in use";
 /// Bytes of a daemon's last words that an error shows.
 const LAST_WORDS_MAX: usize = 2000;
 
@@ -145,7 +147,8 @@ impl Folders {
             return Ok(client);
         }
         let _lock = seat.lock().await?;
-        let mut attempt = 1;
+        let deadline = Instant::now() + LEAVE_TIMEOUT;
+        let mut waited = false;
         loop {
             // Another client may have started it while we waited.
             if let Ok(client) = Client::connect_path(&seat.socket()).await {
@@ -159,8 +162,12 @@ impl Folders {
                     ));
                     return Ok(client);
                 }
-                Err(ClientError::Start(_)) if attempt < ATTEMPTS && seat.is_leaving() => {
-                    attempt += 1;
+                // Its predecessor has closed the sockets but not left the folder yet.
+                Err(ClientError::Start(text)) if text.contains(IN_USE) && Instant::now() < deadline => {
+                    if !waited {
+                        say("waiting for the last daemon to leave");
+                    }
+                    waited = true;
                     tokio::time::sleep(RETRY_WAIT).await;
                 }
                 Err(error) => return Err(error),
@@ -235,12 +242,6 @@ impl<'a> Seat<'a> {
             }
             tokio::time::sleep(LOCK_POLL).await;
         }
-    }
-
-    /// Whether a daemon whose socket is closed still holds the state folder.
-    fn is_leaving(&self) -> bool {
-        let words = last_words(&self.log());
-        words.contains("another daemon") || words.contains("already")
     }
 
     /// Starts the daemon and waits until it is ready; returns its process id.
