@@ -127,7 +127,8 @@ impl Request {
     }
 }
 
-fn check_path(field: &str, path: &Path) -> Result<(), JobError> {
+/// Checks a path that a client names.
+pub(crate) fn check_path(field: &str, path: &Path) -> Result<(), JobError> {
     let bytes = path.as_os_str().as_encoded_bytes();
     let wrong = if bytes.is_empty() {
         "is empty"
