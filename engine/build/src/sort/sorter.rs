@@ -81,11 +81,8 @@ impl Sorter {
         let spilled: u64 = self.runs.iter().map(Run::records).sum();
         let hinted = expected.map_or(0, |points| (points as f64 * LEN_HINT_TRUST) as u64);
         let left = hinted.saturating_sub(spilled).max(self.buffer.len() as u64);
-        check_room(
-            scratch.free_bytes()?,
-            left * size_of::<PointRecord>() as u64,
-            scratch.path(),
-        )?;
+        let needed = left.saturating_mul(size_of::<PointRecord>() as u64);
+        check_room(scratch.free_bytes()?, needed, scratch.path())?;
         let mut writer = RunWriter::create(scratch, self.traffic.runs)?;
         let sorted = self.buffer.sorted(quantizer);
         for (done, (_, point)) in sorted.iter().enumerate() {
