@@ -42,8 +42,8 @@ impl Default for BuildHost {
     }
 }
 
-/// Builds the octree of all points of `stream` and publishes it as `request.output`. `observer` is called for every few thousand
-/// points; `Break` cancels the build.
+/// Builds the octree of all points of `stream` and publishes it as `request.output`. `observer` is called for every few
+/// thousand points; `Break` cancels the build.
 ///
 /// # Errors
 /// See [`BuildError`]. Nothing is left behind then: no output, no temporary, no scratch.

@@ -68,11 +68,12 @@ impl Sorter {
         self.traffic
     }
 
-    /// Sorts the points in memory and writes them to scratch as a run. `expected` is how many points the input says it has.
+    /// Sorts the points in memory and writes them to scratch as a run. `expected` is how many points the input says it
+    /// has.
     ///
     /// # Errors
-    /// [`StoreError::NoSpace`] before anything is written where the runs obviously do not fit; other errors of scratch; those of
-    /// `watch`.
+    /// [`StoreError::NoSpace`] before anything is written where the runs obviously do not fit; other errors of scratch;
+    /// those of `watch`.
     pub fn spill(&mut self, quantizer: &Quantizer, expected: Option<u64>, watch: Watch<'_>) -> Result<(), BuildError> {
         let scratch = match &mut self.scratch {
             Some(scratch) => scratch,

@@ -1,5 +1,5 @@
-//! Whatever fails, and wherever a build is stopped or killed, there is the right scene or none, nothing is left, and the next try
-//! succeeds.
+//! Whatever fails, and wherever a build is stopped or killed, there is the right scene or none, nothing is left, and
+//! the next try succeeds.
 
 use crate::support::{Cloud, Place, Tree, build_cloud, sheet, small_pages};
 use nix::errno::Errno;
