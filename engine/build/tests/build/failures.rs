@@ -1,5 +1,5 @@
-//! Whatever fails, and wherever a build is stopped or killed, there is the right scene or none, nothing is left, and the next try
-//! succeeds.
+//! Whatever fails, and wherever a build is stopped or killed, there is the right scene or none, nothing is left, and
+//! the next try succeeds.
 
 use crate::support::{Cloud, Place, Tree, build_cloud, sheet, small_pages};
 use nix::errno::Errno;
@@ -247,7 +247,7 @@ fn killed_build_child() {
 #[test]
 fn a_killed_build_leaves_no_scene_and_its_scratch_is_swept() {
     let place = Place::on_disk();
-    let mut kills = 0;
+    let (mut kills, mut swept_bytes) = (0, 0);
     for at in (1..).step_by(2) {
         let status = Command::new(std::env::current_exe().unwrap())
             .args(["--exact", "failures::killed_build_child", "--quiet"])
@@ -263,9 +263,13 @@ fn a_killed_build_leaves_no_scene_and_its_scratch_is_swept() {
         assert!(matches!(place.open(), Err(StoreError::Missing { .. })));
         let swept = sweep_scratch(&OsVolume, &place.scratch()).unwrap();
         assert!(swept.folders <= 1);
+        swept_bytes += swept.bytes;
         sweep_temporaries(&OsVolume, &place.output()).unwrap();
         assert!(place.leftovers(&OsVolume).is_empty());
     }
-    assert!(kills >= 5, "{kills}");
+    assert!(
+        kills >= 5 && swept_bytes > 0,
+        "{kills} kills, {swept_bytes} bytes swept"
+    );
     Tree::audit(&place.open().unwrap(), &cloud().points);
 }
