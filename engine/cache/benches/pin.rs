@@ -2,8 +2,21 @@
 //!
 //!     cargo bench -p pbgi-cache
 //!
-//! TABLE
-#![cfg_attr(loom, allow(unused))]
+//! 2 cores (shared, so best of 7 rounds), Linux 6.18, 2026-11, release profile:
+//!
+//! ```text
+//! plain memory, 64 pages in turn                                  0.5 ns
+//! local hit, 64 pages in turn                                     2.9 ns
+//! local hit, the same page                                        1.6 ns
+//! local hit behind the front table, 1,000 pages                  19.9 ns
+//! shared hit with eviction from the local cache                 208.2 ns
+//! pin + unpin of one shared page                                 24.3 ns
+//! pin + unpin, 2,048 shared pages in turn                        20.6 ns
+//! look-up of a page that is not there                             2.9 ns
+//! owner: fetch of one resident page                              56.5 ns
+//! owner: fetch with eviction, empty load, reap                 1093.2 ns
+//! ```
+#![allow(clippy::unwrap_used, reason = "a bench that cannot run has nothing to say")]
 
 #[cfg(loom)]
 fn main() {}
@@ -48,7 +61,7 @@ fn main() {
             black_box(plain[walk(step) as usize][64]);
         }),
     );
-    let mut get = |cache: &mut pbgi_cache::LocalCache, key: PageKey| {
+    let get = |cache: &mut pbgi_cache::LocalCache, key: PageKey| {
         black_box(cache.get(key).map(|page| page[64]));
     };
     report(

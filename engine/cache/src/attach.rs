@@ -55,8 +55,8 @@ impl CacheView {
         let memory = MmapOptions::new().len(bytes as usize).map_raw_read_only(&readable);
         let memory = memory.map_err(|error| os("map", name, error))?;
         let base = NonNull::new(memory.as_mut_ptr()).ok_or_else(|| os("map", name, "null address"))?;
-        // SAFETY: Rules 1 and 9: mapped with the bytes that the layout says, reserved by the owner, kept in `_memory`; this process
-        // cannot write to it.
+        // SAFETY: Rules 1 and 9: mapped with the bytes that the layout says, reserved by the owner, kept in
+        // `_memory`; this process cannot write to it.
         let map = unsafe { SegmentMap::new(base, layout) };
         let ledger = Ledger::map(name, &map, slot)?;
         // One view for a slot (Rule 4), or two of them could take back each other's pins.
@@ -121,7 +121,8 @@ impl CacheView {
         unpin(&self.ledger.pins(kind)[word], mask);
     }
 
-    /// Whether this worker has a pin on the frame and the frame holds that page: what a reply of the owner promises (Rule 7).
+    /// Whether this worker has a pin on the frame and the frame holds that page: what a reply of the owner promises
+    /// (Rule 7).
     pub(crate) fn holds(&self, key: PageKey, frame: FrameId) -> bool {
         let Some(header) = self.map.frame_headers(key.kind).get(frame.0 as usize) else {
             return false;
@@ -175,8 +176,8 @@ impl Deref for PagePin<'_> {
 
     #[inline]
     fn deref(&self) -> &[u8] {
-        // SAFETY: Rule 4: pinned when `self` was made, unpinned when it is dropped, and nobody else can unpin meanwhile: the view
-        // is borrowed exclusively, and is the only one of its slot.
+        // SAFETY: Rule 4: pinned when `self` was made, unpinned when it is dropped, and nobody else can unpin
+        // meanwhile: the view is borrowed exclusively, and is the only one of its slot.
         unsafe { self.view.frame(self.kind, self.frame) }
     }
 }
@@ -230,8 +231,9 @@ impl Ledger {
 
     #[inline]
     fn words(&self, offset: usize, words: usize) -> &[AtomicU64] {
-        // SAFETY: Rules 2 and 9: `offset` and `words` are those that `Offsets` gives for a bitmap of this window, which is as long as
-        // `Offsets` says, page-aligned, writable, accessed as `AtomicU64` only, and mapped as long as `self.memory` lives.
+        // SAFETY: Rules 2 and 9: `offset` and `words` are those that `Offsets` gives for a bitmap of this window,
+        // which is as long as `Offsets` says, page-aligned, writable, accessed as `AtomicU64` only, and mapped as
+        // long as `self.memory` lives.
         unsafe { slice::from_raw_parts(self.memory.as_mut_ptr().add(offset).cast(), words) }
     }
 }
@@ -239,6 +241,7 @@ impl Ledger {
 fn read_header(name: &str, descriptor: &impl std::os::fd::AsRawFd) -> Result<Header, CacheError> {
     let page = MmapOptions::new().len(ALIGN).map_raw_read_only(descriptor.as_raw_fd());
     let page = page.map_err(|error| os("map", name, error))?;
-    // SAFETY: Rule 9: the object has at least a page, just mapped; the header is written once, before a worker learns the name.
+    // SAFETY: Rule 9: the object has at least a page, just mapped; the header is written once, before a worker learns
+    // the name.
     Ok(unsafe { page.as_ptr().cast::<Header>().read() })
 }

@@ -1,5 +1,5 @@
-//! The miss channel: how a worker asks for pages that it did not find. Fixed-size messages over a Unix stream socket, blocking on
-//! both sides; the daemon has one thread for each worker.
+//! The miss channel: how a worker asks for pages that it did not find. Fixed-size messages over a Unix stream socket,
+//! blocking on both sides; the daemon has one thread for each worker.
 //!
 //! ```text
 //! daemon -> worker   Welcome        once, first
@@ -7,11 +7,14 @@
 //! daemon -> worker   PageReply      an outcome for each, in the same order; the pages are pinned by then
 //! ```
 //!
-//! All numbers are little-endian. Every message begins with its magic, and every field is checked: the peer may be another build.
+//! All numbers are little-endian. Every message begins with its magic, and every field is checked: the peer may be
+//! another build.
 
 use crate::error::{CacheError, LoadErrorKind};
 use crate::frame::FrameId;
 use crate::owner::{Fetched, Origin, Seat};
+use crate::wire::malformed;
+pub use crate::wire::{Reader, Writer};
 use pbgi_core::limits::MOUNTS_MAX;
 use pbgi_core::{MountId, PageKey, PageKind, PageNo};
 use std::io::{ErrorKind, Read, Write};
@@ -43,10 +46,7 @@ pub trait Message: Sized {
         let mut bytes = vec![0; Self::BYTES];
         let (magic, fields) = bytes.split_at_mut(Self::MAGIC.len());
         magic.copy_from_slice(&Self::MAGIC);
-        self.put(&mut Writer {
-            rest: fields,
-            message: Self::NAME,
-        })?;
+        self.put(&mut Writer::new(fields, Self::NAME))?;
         Ok(bytes)
     }
 
@@ -58,11 +58,7 @@ pub trait Message: Sized {
                 format!("{} bytes that do not begin with its magic", bytes.len()),
             ));
         }
-        let mut reader = Reader {
-            rest: &bytes[Self::MAGIC.len()..],
-            message: Self::NAME,
-        };
-        Self::take(&mut reader)
+        Self::take(&mut Reader::new(&bytes[Self::MAGIC.len()..], Self::NAME))
     }
 }
 
@@ -217,10 +213,10 @@ fn take_key(from: &mut Reader<'_>) -> Result<PageKey, CacheError> {
     let kind = match kind {
         0 => PageKind::Node,
         1 => PageKind::Point,
-        other => return Err(malformed(from.message, format!("page kind {other}"))),
+        other => return Err(malformed(PageRequest::NAME, format!("page kind {other}"))),
     };
     if usize::from(slot) >= MOUNTS_MAX {
-        return Err(malformed(from.message, format!("mount slot {slot}")));
+        return Err(malformed(PageRequest::NAME, format!("mount slot {slot}")));
     }
     Ok(PageKey {
         mount: MountId { slot, generation },
@@ -316,7 +312,7 @@ fn take_outcome(from: &mut Reader<'_>) -> Result<PageOutcome, CacheError> {
         2 => pinned(Origin::ResidentOtherJob),
         _ => match (code & FAILED != 0).then(|| LoadErrorKind::try_from(code & !FAILED)) {
             Some(Ok(kind)) => Ok(PageOutcome::Failed(kind)),
-            _ => Err(malformed(from.message, format!("outcome {code}"))),
+            _ => Err(malformed(PageReply::NAME, format!("outcome {code}"))),
         },
     }
 }
@@ -331,59 +327,10 @@ fn page_count(message: &'static str, count: usize) -> Result<u8, CacheError> {
     }
 }
 
-fn malformed(message: &'static str, what: String) -> CacheError {
-    CacheError::Malformed { message, what }
-}
-
-/// Where a message's fields go.
-#[derive(Debug)]
-pub struct Writer<'a> {
-    rest: &'a mut [u8],
-    message: &'static str,
-}
-
-impl Writer<'_> {
-    fn bytes(&mut self, bytes: &[u8]) -> Result<(), CacheError> {
-        let rest = std::mem::take(&mut self.rest);
-        let Some((field, rest)) = rest.split_at_mut_checked(bytes.len()) else {
-            return Err(malformed(self.message, "more fields than it holds".into()));
-        };
-        field.copy_from_slice(bytes);
-        self.rest = rest;
-        Ok(())
-    }
-}
-
-/// Where a message's fields come from.
-#[derive(Debug)]
-pub struct Reader<'a> {
-    rest: &'a [u8],
-    message: &'static str,
-}
-
-impl Reader<'_> {
-    fn bytes<const N: usize>(&mut self) -> Result<[u8; N], CacheError> {
-        let (field, rest) = self
-            .rest
-            .split_first_chunk()
-            .ok_or_else(|| malformed(self.message, "too few bytes".into()))?;
-        self.rest = rest;
-        Ok(*field)
-    }
-
-    fn text(&mut self, length: usize) -> Result<String, CacheError> {
-        let (field, rest) = self
-            .rest
-            .split_at_checked(length)
-            .ok_or_else(|| malformed(self.message, "too few bytes".into()))?;
-        self.rest = rest;
-        String::from_utf8(field.to_vec()).map_err(|_| malformed(self.message, "text that is not UTF-8".into()))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::collection::vec;
     use proptest::prelude::*;
     use std::os::unix::net::UnixStream;
 
@@ -486,7 +433,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_decode_to_a_message_that_encodes_or_to_an_error(bytes in prop::collection::vec(any::<u8>(), PageReply::BYTES)) {
+        fn any_bytes_decode_to_a_message_that_encodes_or_to_an_error(bytes in vec(any::<u8>(), PageReply::BYTES)) {
             let mut reply = bytes.clone();
             reply[..4].copy_from_slice(&PageReply::MAGIC);
             reply[12] = bytes[0] % 20;

@@ -21,8 +21,9 @@ pub enum TagState {
     Doomed,
 }
 
-/// A frame's tag: `[state 8][mount slot 8][mount generation 16][page 32]`, so that one comparison settles whether the frame holds
-/// a page, and a frame reused for another scene never compares equal. The page's kind is that of the pool.
+/// A frame's tag: `[state 8][mount slot 8][mount generation 16][page 32]`, so that one comparison settles whether the
+/// frame holds a page, and a frame reused for another scene never compares equal. The page's kind is that of the
+/// pool.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Tag(pub u64);
 

@@ -3,7 +3,7 @@
 //! ```text
 //! 0                                                                   every part begins on a page of 4,096 bytes
 //! +-----------------+
-//! | header          |  magic, version, layout hash, numbers of the two pools; written once, before the first worker attaches
+//! | header          |  magic, version, layout hash, numbers of the two pools; written once, before anyone attaches
 //! +-----------------+
 //! | node frames'    |  frames x [ tag u64 | job u64 ]           16 bytes a frame, written by the owner
 //! | headers         |
@@ -13,7 +13,7 @@
 //! | point frames' headers, point page table                     likewise
 //! +-----------------+
 //! | ledger 0        |  [ attached u64 .. 64 bytes ]             mapped writable by the worker in slot 0 alone;
-//! |                 |  [ node pins   | node touched  ]          bit f of a bitmap is frame f; each bitmap is padded to 64 bytes
+//! |                 |  [ node pins   | node touched  ]      bit f of a bitmap is frame f; padded to 64 bytes
 //! |                 |  [ point pins  | point touched ]
 //! +-----------------+
 //! | ledger 1 ..     |
@@ -133,7 +133,7 @@ impl SegmentLayout {
             // Rule 10, first half for progress, second half as the paper splits shared and local memory.
             if local + loads >= frames || local > frames / 2 {
                 return Err(invalid(format!(
-                    "{workers} workers x {} local {kind} frames + {loads} loads in flight leave no evictable frame of {frames}",
+                    "{workers} workers x {} local {kind} frames + {loads} loads leave no evictable frame of {frames}",
                     pool.local_frames
                 )));
             }

@@ -1,11 +1,12 @@
 //! The shared page cache: octree pages in POSIX shared memory, written by one daemon, read by many worker processes.
 //!
-//! The daemon's side is [`CacheOwner`] over a [`Segment`]: it loads pages, evicts them and repairs what a dead worker leaves.
-//! A worker's side is [`LocalCache`] over a [`CacheView`]: it finds pages and pins them without a call and without a lock.
-//! What a worker does not find it asks for over the miss channel ([`channel`]).
+//! The daemon's side is [`CacheOwner`] over a [`Segment`]: it loads pages, evicts them and repairs what a dead worker
+//! leaves. A worker's side is [`LocalCache`] over a [`CacheView`]: it finds pages and pins them without a call and
+//! without a lock. What a worker does not find it asks for over the miss channel ([`channel`]).
 //!
-//! The access rules are numbered in this crate's `README.md`; code cites them by number. This is the crate with `unsafe`, and
-//! it is confined to the modules below that say so. The crate knows no files: whoever calls [`CacheOwner::fetch`] reads them.
+//! The access rules are numbered in this crate's `README.md`; code cites them by number. This is the crate with
+//! `unsafe`, and it is confined to the modules below that say so. The crate knows no files: whoever calls
+//! [`CacheOwner::fetch`] reads them.
 
 pub mod protocol;
 
@@ -53,6 +54,8 @@ mod pool;
 mod segment;
 #[cfg(not(loom))]
 mod victim;
+#[cfg(not(loom))]
+mod wire;
 
 #[cfg(not(loom))]
 pub use {

@@ -1,7 +1,8 @@
 //! A worker's own cache: an exact LRU of pins on frames of the shared cache, never copies.
 //!
-//! A repeated hit costs a few nanoseconds and writes nothing shared: a small direct-mapped table answers it. Such hits only leave
-//! a time stamp there; before anything is evicted the stamps are replayed, oldest first, into the LRU order, which is therefore exact.
+//! A repeated hit costs a few nanoseconds and writes nothing shared: a small direct-mapped table answers it. Such
+//! hits only leave a time stamp there; before anything is evicted the stamps are replayed, oldest first, into the LRU
+//! order, which is therefore exact.
 
 use crate::attach::CacheView;
 use crate::error::CacheError;
@@ -57,7 +58,8 @@ impl LocalCache {
 
     /// The page, if it is in the local or in the shared cache; then it is pinned, and most recently used.
     ///
-    /// The slice is a whole frame, aligned to 4,096 bytes: cut it to the scene's page size before casting it to records.
+    /// The slice is a whole frame, aligned to 4,096 bytes: cut it to the scene's page size before casting it to
+    /// records.
     #[inline]
     pub fn get(&mut self, key: PageKey) -> Option<&[u8]> {
         let tag = Tag::resident(key);
@@ -71,13 +73,14 @@ impl LocalCache {
         } else {
             self.find(key)?
         };
-        // SAFETY: Rule 4: the frame is in the local cache, so its pin is held; pins are given up only by methods that borrow `self`
-        // exclusively, which the result's lifetime forbids.
+        // SAFETY: Rule 4: the frame is in the local cache, so its pin is held; pins are given up only by methods that
+        // borrow `self` exclusively, which the result's lifetime forbids.
         Some(unsafe { self.view.frame(key.kind, frame) })
     }
 
-    /// Makes room for `count` pages of a kind (at most the capacity, so a request has no more either): **before** the owner is asked for them, since it pins them in this
-    /// worker's name and refuses to exceed the capacity (Rule 10).
+    /// Makes room for `count` pages of a kind (at most the capacity, so a request has no more either): **before** the
+    /// owner is asked for them, since it pins them in this worker's name and refuses to exceed the capacity (Rule
+    /// 10).
     pub fn reserve(&mut self, kind: PageKind, count: usize) {
         let pool = &mut self.pools[kind as usize];
         let capacity = pool.lru.cap().get();

@@ -1,4 +1,5 @@
-//! The accessors of the segment: from a base address and a layout to atomics and frames, each checked against its bound.
+//! The accessors of the segment: from a base address and a layout to atomics and frames, each checked against its
+//! bound.
 
 use crate::frame::FrameId;
 use crate::layout::{FrameHeader, Header, Offsets, SegmentLayout};
@@ -14,8 +15,8 @@ pub(crate) struct SegmentMap {
     at: Offsets,
 }
 
-// SAFETY: Rule 2: everything shared is reached as atomics; frames are handed out by `frame` and `frame_mut` alone, whose callers
-// answer for who else looks at them (Rules 4 and 6).
+// SAFETY: Rule 2: everything shared is reached as atomics; frames are handed out by `frame` and `frame_mut` alone,
+// whose callers answer for who else looks at them (Rules 4 and 6).
 unsafe impl Send for SegmentMap {}
 // SAFETY: as above.
 unsafe impl Sync for SegmentMap {}
@@ -23,8 +24,9 @@ unsafe impl Sync for SegmentMap {}
 impl SegmentMap {
     /// # Safety
     ///
-    /// `base` is page-aligned and begins a mapping of at least `layout.total_bytes()` bytes that outlives the result (Rule 9), backed
-    /// by reserved memory. Nobody writes to the mapping but through the accessors of this type (Rule 1).
+    /// `base` is page-aligned and begins a mapping of at least `layout.total_bytes()` bytes that outlives the result
+    /// (Rule 9), backed by reserved memory. Nobody writes to the mapping but through the accessors of this type (Rule
+    /// 1).
     pub(crate) unsafe fn new(base: NonNull<u8>, layout: SegmentLayout) -> Self {
         let at = Offsets::new(&layout);
         Self { base, layout, at }
@@ -54,7 +56,8 @@ impl SegmentMap {
     #[inline]
     pub(crate) fn frame_headers(&self, kind: PageKind) -> &[FrameHeader] {
         let frames = self.layout.pool(kind).frames as usize;
-        // SAFETY: Rules 2 and 9: `Offsets` keeps the part within the mapping and aligned, and its contents are atomics only.
+        // SAFETY: Rules 2 and 9: `Offsets` keeps the part within the mapping and aligned, and its contents are
+        // atomics only.
         unsafe {
             slice::from_raw_parts(
                 self.base.add(self.at.frame_headers[kind as usize]).cast().as_ptr(),
@@ -109,7 +112,8 @@ impl SegmentMap {
 
     /// # Safety
     ///
-    /// `offset` is a multiple of 8, and `words` words from it lie in a part of the segment that is accessed as `AtomicU64` only (Rule 2).
+    /// `offset` is a multiple of 8, and `words` words from it lie in a part of the segment that is accessed as
+    /// `AtomicU64` only (Rule 2).
     #[inline]
     unsafe fn words(&self, offset: usize, words: usize) -> &[AtomicU64] {
         // SAFETY: Rule 9: the mapping outlives `self`; the rest is this function's contract.
@@ -132,8 +136,8 @@ impl SegmentMap {
     ///
     /// # Safety
     ///
-    /// The mapping is writable, and the caller claimed the frame: its tag is `Loading` on the caller's behalf and no ledger has its
-    /// bit (Rule 6). The result is dropped before the frame is published or given up.
+    /// The mapping is writable, and the caller claimed the frame: its tag is `Loading` on the caller's behalf and no
+    /// ledger has its bit (Rule 6). The result is dropped before the frame is published or given up.
     #[expect(
         clippy::mut_from_ref,
         reason = "exclusive by the claim, which is this function's contract"

@@ -1,7 +1,7 @@
 //! The daemon's side: who loads a page, into which frame, and what becomes of pins whose worker died.
 //!
-//! Entry points: [`CacheOwner::fetch`], [`CacheOwner::reap`], [`CacheOwner::mount`] and [`CacheOwner::unmount`]. One lock a pool, in
-//! this process only; pages are loaded outside it.
+//! Entry points: [`CacheOwner::fetch`], [`CacheOwner::reap`], [`CacheOwner::mount`] and [`CacheOwner::unmount`]. One
+//! lock a pool, in this process only; pages are loaded outside it.
 
 use crate::counters::{CacheCounters, JobCounters};
 use crate::error::{CacheError, LoadError, LoadErrorKind};
@@ -16,14 +16,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// How long a fetch waits for a frame to become evictable. By rule 10 one always is, unless a worker scribbled on its ledger; the
-/// supervisor finds that one ([`CacheOwner::overrun`]) and kills it well within this time.
+/// How long a fetch waits for a frame to become evictable. By rule 10 one always is, unless a worker scribbled on its
+/// ledger; the supervisor finds that one ([`CacheOwner::overrun`]) and kills it well within this time.
 const EVICTABLE_WAIT: Duration = Duration::from_secs(10);
 /// Unpinning wakes nobody (it is a bit in a worker's ledger), so waiting for it looks again this often.
 const EVICTABLE_POLL: Duration = Duration::from_millis(5);
 
-/// Jobs whose counters are kept at a time; a fetch for one more is refused. Far more than a daemon runs at once, so only a server that
-/// forgets [`CacheOwner::end_job`], or a worker that makes numbers up, comes here.
+/// Jobs whose counters are kept at a time; a fetch for one more is refused. Far more than a daemon runs at once, so
+/// only a server that forgets [`CacheOwner::end_job`], or a worker that makes numbers up, comes here.
 pub const JOBS_MAX: usize = 16_384;
 
 /// A worker's seat: a slot, and how often the slot was given to a new worker.
@@ -55,7 +55,8 @@ pub enum Origin {
     ResidentOtherJob,
 }
 
-/// The owner of the cache: the one writer of frames, tags and page tables (Rule 1). Shared by the threads that serve workers.
+/// The owner of the cache: the one writer of frames, tags and page tables (Rule 1). Shared by the threads that serve
+/// workers.
 #[derive(Debug)]
 pub struct CacheOwner {
     segment: Segment,
@@ -94,7 +95,8 @@ impl CacheOwner {
         self.segment.layout()
     }
 
-    /// The seat of whoever is, or will next be, in a slot.
+    /// The seat of whoever is, or will next be, in a slot. Take it **before** the worker starts: taken later it may
+    /// be that of a successor, and requests that the dead worker left behind would pin for it.
     pub fn seat(&self, slot: u8) -> Result<Seat, CacheError> {
         let state = self.lock(PageKind::Node);
         match state.epochs.get(usize::from(slot)) {
@@ -125,7 +127,8 @@ impl CacheOwner {
         Ok(())
     }
 
-    /// Closes the cache for a scene and drops its pages: at once where nobody pins them, else as soon as the last pin is gone.
+    /// Closes the cache for a scene and drops its pages: at once where nobody pins them, else as soon as the last pin
+    /// is gone.
     pub fn unmount(&self, mount: MountId) {
         for kind in KINDS {
             let freed = self.lock(kind).unmount(self.segment.map(), mount);
@@ -135,9 +138,10 @@ impl CacheOwner {
     }
 
     /// Makes a page resident and pins it for the worker in `seat`, on behalf of job number `job`.
+    /// Of the loads that may be in flight, one scene gets half at most.
     ///
-    /// `load` is called, outside every lock, if the page has to be read; its buffer has exactly the page's bytes. Of all who ask for a
-    /// page at once one loads, and all get its outcome. A seat fetches one page at a time.
+    /// `load` is called, outside every lock, if the page has to be read; its buffer has exactly the page's bytes. Of
+    /// all who ask for a page at once one loads, and all get its outcome. A seat fetches one page at a time.
     pub fn fetch(
         &self,
         seat: Seat,
@@ -156,8 +160,8 @@ impl CacheOwner {
             job,
             frame,
         };
-        // SAFETY: Rule 6: `admit` claimed the frame for this call, and `landing` gives it up after this slice's last use, also when
-        // `load` panics.
+        // SAFETY: Rule 6: `admit` claimed the frame for this call, and `landing` gives it up after this slice's last
+        // use, also when `load` panics.
         let page = unsafe { self.segment.map().frame_mut(key.kind, frame, page_bytes) };
         let outcome = load(page);
         landing.finish(outcome)?;
@@ -167,8 +171,8 @@ impl CacheOwner {
         })
     }
 
-    /// Frees what a dead worker held, and retires its seat; returns the number of its pins. Call it after `wait` returned for the
-    /// process, and before the slot is filled again (Rule 8).
+    /// Frees what a dead worker held, and retires its seat; returns the number of its pins. Call it after `wait`
+    /// returned for the process, and before the slot is filled again (Rule 8).
     pub fn reap(&self, slot: u8) -> Result<u32, CacheError> {
         let seat = self.seat(slot)?;
         let map = self.segment.map();
@@ -224,7 +228,8 @@ impl CacheOwner {
         }
     }
 
-    /// The counters of a job. A record is kept for each job number until [`CacheOwner::end_job`], for [`JOBS_MAX`] at most.
+    /// The counters of a job. A record is kept for each job number until [`CacheOwner::end_job`], for [`JOBS_MAX`] at
+    /// most.
     pub fn job_counters(&self, job: u64) -> JobCounters {
         let mut sum = JobCounters::default();
         for kind in KINDS {
@@ -279,7 +284,7 @@ impl CacheOwner {
                 let origin = state.count_hit(map, frame, job, false);
                 return Ok(Admission::Done(Fetched { frame, origin }));
             }
-            if state.flights.len() < self.layout().loads_in_flight_max() as usize {
+            if state.has_load_for(key.mount) {
                 let (claimed, freed) = state.claim(map, tag);
                 self.resident_bytes.fetch_sub(freed, Ordering::Relaxed);
                 if let Some(frame) = claimed {

@@ -1,8 +1,8 @@
-//! The page table: from a page to the frame that holds it. Open addressing with linear probing over words of the segment, written
-//! by the owner, searched by everyone (Rule 2).
+//! The page table: from a page to the frame that holds it. Open addressing with linear probing over words of the
+//! segment, written by the owner, searched by everyone (Rule 2).
 //!
-//! A slot is `hash << 32 | frame + 1`, or 0. The frame's tag is the truth, the slot only a hint: a search that runs while the
-//! owner moves slots may miss a page, and then asks the owner, who never does.
+//! A slot is `hash << 32 | frame + 1`, or 0. The frame's tag is the truth, the slot only a hint: a search that runs
+//! while the owner moves slots may miss a page, and then asks the owner, who never does.
 
 use crate::frame::FrameId;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -33,8 +33,11 @@ pub(crate) fn find(table: &[AtomicU64], hash: u32, mut holds: impl FnMut(FrameId
 pub(crate) fn insert(table: &[AtomicU64], hash: u32, frame: FrameId) {
     let mask = table.len() - 1;
     let mut at = hash as usize & mask;
+    let mut probes = 0;
     while table[at].load(Ordering::Relaxed) != 0 {
         at = (at + 1) & mask;
+        probes += 1;
+        assert!(probes < table.len(), "the page table is full");
     }
     table[at].store(u64::from(hash) << 32 | u64::from(frame.0 + 1), Ordering::Relaxed);
 }

@@ -40,7 +40,8 @@ impl CacheBudget {
         }
     }
 
-    /// Splits the budget: node and point pools by `node_share`, half of each pool to the workers' local caches in equal parts.
+    /// Splits the budget: node and point pools by `node_share`, half of each pool to the workers' local caches in
+    /// equal parts.
     pub fn plan(&self) -> Result<SegmentLayout, CacheError> {
         if !(self.node_share > 0.0 && self.node_share < 1.0) {
             return Err(CacheError::Layout {
@@ -101,7 +102,8 @@ impl CacheBudget {
         )
     }
 
-    /// Fewest frames of a pool: every worker has its least, and as many plus the loads in flight and one more are evictable.
+    /// Fewest frames of a pool: every worker has its least, and as many plus the loads in flight and one more are
+    /// evictable.
     fn frames_min(&self) -> u32 {
         let local = self.workers.saturating_mul(LOCAL_FRAMES_MIN);
         let in_flight = self.loads_in_flight_max.saturating_add(1);

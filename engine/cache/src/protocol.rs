@@ -1,7 +1,7 @@
 //! The pin and evict protocol, written once over the atomics of `sync` so that the model checker runs this very code.
 //!
-//! Entry points: [`try_pin`] and [`unpin`] for a worker; [`try_claim`], [`publish`], [`owner_pin`] and [`reap`] for the daemon.
-//! README rules 3 to 7 are implemented here and nowhere else.
+//! Entry points: [`try_pin`] and [`unpin`] for a worker; [`try_claim`], [`publish`], [`owner_pin`] and [`reap`] for
+//! the daemon. README rules 3 to 7 are implemented here and nowhere else.
 
 use crate::frame::{Tag, TagState};
 use crate::sync::{AtomicU64, Ordering, fence};
@@ -35,15 +35,16 @@ pub fn load_tag(tag: &AtomicU64) -> Tag {
 
 /// Pins a frame if it holds the page of `resident`: announce in `pins` (the caller's own ledger), then look again.
 ///
-/// `mask` has the frame's one bit. On `true` the frame's bytes stay unchanged until [`unpin`]. On `false` the ledger is as before.
+/// `mask` has the frame's one bit. On `true` the frame's bytes stay unchanged until [`unpin`]. On `false` the ledger
+/// is as before.
 #[inline(always)]
 pub fn try_pin<B: Barrier>(tag: &AtomicU64, pins: &AtomicU64, mask: u64, resident: Tag) -> bool {
     if load_tag(tag) != resident {
         return false;
     }
     if pins.fetch_or(mask, Ordering::Relaxed) & mask != 0 {
-        // The bit was there before the tag was read, so the tag cannot have moved to another page: nothing to look at again,
-        // and nothing to take back while the owner only tries the frame (Rule 5).
+        // The bit was there before the tag was read, so the tag cannot have moved to another page: nothing to look at
+        // again, and nothing to take back while the owner only tries the frame (Rule 5).
         return true;
     }
     B::full(); // Rule 3: the pin is visible before the tag is read again.
@@ -62,8 +63,8 @@ pub fn unpin(pins: &AtomicU64, mask: u64) {
 
 /// Claims a frame that holds `resident` for its owner: afterwards its tag is `claimed` and nobody holds or gets a pin.
 ///
-/// `ledgers` yields the word of every ledger that has the frame's bit. Returns `false`, with the tag as before, if one has it set.
-/// Only the owner calls this, one call at a time for a pool (Rule 1).
+/// `ledgers` yields the word of every ledger that has the frame's bit. Returns `false`, with the tag as before, if
+/// one has it set. Only the owner calls this, one call at a time for a pool (Rule 1).
 #[inline]
 pub fn try_claim<'a, B: Barrier>(
     tag: &AtomicU64,

@@ -22,8 +22,8 @@ const SHM_DIRECTORY: &str = "/dev/shm";
 
 /// The daemon's hold on the segment: made and reserved by [`Segment::create`], unlinked on drop.
 ///
-/// `shared_memory` creates, maps and unlinks it. It leaves the memory unreserved, where a touch may end in SIGBUS, so it is
-/// reserved here before the first touch.
+/// `shared_memory` creates, maps and unlinks it. It leaves the memory unreserved, where a touch may end in SIGBUS, so
+/// it is reserved here before the first touch.
 pub struct Segment {
     map: SegmentMap,
     name: String,
@@ -34,14 +34,15 @@ pub struct Segment {
 
 struct Mapping(Shmem);
 
-// SAFETY: Rule 9: the mapping is process-wide, used through `SegmentMap` only, and unmapped once, by whichever thread drops it.
+// SAFETY: Rule 9: the mapping is process-wide, used through `SegmentMap` only, and unmapped once, by whichever thread
+// drops it.
 unsafe impl Send for Mapping {}
 // SAFETY: as above; `Mapping` has no methods.
 unsafe impl Sync for Mapping {}
 
 impl Segment {
-    /// A name that nobody can guess (128 random bits). Write it to the state file before [`Segment::create`], so that whatever happens
-    /// the next start can [`Segment::unlink`] it.
+    /// A name that nobody can guess (128 random bits). Write it to the state file before [`Segment::create`], so that
+    /// whatever happens the next start can [`Segment::unlink`] it.
     pub fn unique_name() -> Result<String, CacheError> {
         let mut random = [0; NAME_DIGITS / 2];
         File::open("/dev/urandom")
@@ -50,10 +51,12 @@ impl Segment {
         Ok(format!("{NAME_PREFIX}{:032x}", u128::from_le_bytes(random)))
     }
 
-    /// Creates the segment, with mode 0600, and reserves all of it. A segment of that name must not exist. On error nothing is left behind.
+    /// Creates the segment, with mode 0600, and reserves all of it. A segment of that name must not exist. On error
+    /// nothing is left behind.
     pub fn create(name: &str, layout: &SegmentLayout) -> Result<Self, CacheError> {
         let needed = layout.total_bytes();
-        // Asked first, because an attempt to reserve takes what there is before it fails; the attempt itself is what counts.
+        // Asked first, because an attempt to reserve takes what there is before it fails; the attempt itself is what
+        // counts.
         match available() {
             Some(available) if available < needed => Err(CacheError::NoSpace { needed, available }),
             _ => Self::create_unasked(name, layout),
@@ -80,8 +83,8 @@ impl Segment {
         reserve(name, &descriptor, needed)?;
         let status = fstat(&descriptor).map_err(|error| os("inspect", name, error))?;
         let base = NonNull::new(memory.0.as_ptr()).ok_or_else(|| os("map", name, "null address"))?;
-        // SAFETY: Rules 1 and 9: freshly mapped with that many bytes, reserved above, kept in `_memory` beside the map, and
-        // written through the map alone.
+        // SAFETY: Rules 1 and 9: freshly mapped with that many bytes, reserved above, kept in `_memory` beside the
+        // map, and written through the map alone.
         let map = unsafe { SegmentMap::new(base, *layout) };
         // SAFETY: Rule 9: the segment is new and its name known to nobody who would attach before it is handed out.
         unsafe { map.write_header(&layout.header()) };
@@ -94,7 +97,8 @@ impl Segment {
         })
     }
 
-    /// Removes a segment that an earlier daemon left behind, by the name in the state file. Returns whether there was one.
+    /// Removes a segment that an earlier daemon left behind, by the name in the state file. Returns whether there was
+    /// one.
     ///
     /// Only names of this program's making are accepted. Processes that still map the segment keep it until they end.
     pub fn unlink(name: &str) -> Result<bool, CacheError> {
@@ -116,7 +120,8 @@ impl Segment {
         self.map.layout()
     }
 
-    /// Whether the name still leads to this segment. If somebody removed it, running workers go on, new ones cannot attach.
+    /// Whether the name still leads to this segment. If somebody removed it, running workers go on, new ones cannot
+    /// attach.
     pub fn linked(&self) -> Result<bool, CacheError> {
         let descriptor = match shm_open(self.name.as_str(), OFlag::O_RDONLY, Mode::empty()) {
             Ok(descriptor) => descriptor,

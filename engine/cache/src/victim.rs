@@ -1,10 +1,10 @@
-//! Which frame to reuse: second chance (clock) over the frames that nobody pins, with the recency that workers leave in their
-//! touched bits.
+//! Which frame to reuse: second chance (clock) over the frames that nobody pins, with the recency that workers leave
+//! in their touched bits.
 
 use crate::frame::FrameId;
 
-/// Laps of the hand before giving up: one clears touched bits, one meets them cleared, one ignores them, in case workers set
-/// them as fast as the hand clears them.
+/// Laps of the hand before giving up: one clears touched bits, one meets them cleared, one ignores them, in case
+/// workers set them as fast as the hand clears them.
 const LAPS: u32 = 3;
 
 /// What the ledgers say of 64 frames at a time.
@@ -24,8 +24,8 @@ pub(crate) struct Clock {
 }
 
 impl Clock {
-    /// Moves the hand to the next frame that is unpinned, untouched and accepted by `claim`. Pinned frames keep their touched bit:
-    /// whatever leaves a local cache has a whole turn of the hand left (Rule 11).
+    /// Moves the hand to the next frame that is unpinned, untouched and accepted by `claim`. Pinned frames keep their
+    /// touched bit: whatever leaves a local cache has a whole turn of the hand left (Rule 11).
     pub(crate) fn victim(
         &mut self,
         frames: u32,

@@ -2,8 +2,10 @@
 //!
 //!     RUSTFLAGS="--cfg loom" cargo test -p pbgi-cache --release --test loom --target-dir target/loom
 //!
-//! The code under test is the code in use; only the atomics and locks are loom's. `LOOM_MAX_PREEMPTIONS` changes the bound.
+//! The code under test is the code in use; only the atomics and locks are loom's. `LOOM_MAX_PREEMPTIONS` changes the
+//! bound.
 #![cfg(loom)]
+#![allow(clippy::unwrap_used, reason = "a failed step of a test is a failed test")]
 
 use loom::cell::UnsafeCell;
 use loom::sync::atomic::AtomicU64;
@@ -31,8 +33,8 @@ fn page(page: u32) -> Tag {
     })
 }
 
-/// One frame, and the ledger words of two workers. The bytes of the frame are the number of its page; loom reports any access to
-/// them that is not ordered with a write.
+/// One frame, and the ledger words of two workers. The bytes of the frame are the number of its page; loom reports
+/// any access to them that is not ordered with a write.
 struct Frame {
     tag: AtomicU64,
     ledgers: [AtomicU64; 2],

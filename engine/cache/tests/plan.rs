@@ -1,5 +1,6 @@
 //! Every layout that is accepted keeps an evictable frame; every budget that is refused says what would do.
 #![cfg(not(loom))]
+#![allow(clippy::unwrap_used, reason = "a failed step of a test is a failed test")]
 
 use pbgi_cache::{CacheBudget, CacheError, PoolLayout, SegmentLayout};
 use pbgi_core::PageKind;
@@ -14,7 +15,7 @@ fn keeps_an_evictable_frame(layout: &SegmentLayout) {
             "{layout:?}"
         );
         assert!(pinned <= u64::from(pool.frames) / 2, "{layout:?}");
-        assert!(pool.local_frames > 0 && pool.frame_bytes % 4096 == 0);
+        assert!(pool.local_frames > 0 && pool.frame_bytes.is_multiple_of(4096));
     }
 }
 
@@ -46,14 +47,16 @@ proptest! {
             Ok(layout) => {
                 keeps_an_evictable_frame(&layout);
                 prop_assert!(layout.total_bytes() <= budget.bytes);
-                for (kind, bytes) in [(PageKind::Node, budget.node_page_bytes), (PageKind::Point, budget.point_page_bytes)] {
+                let pages = [(PageKind::Node, budget.node_page_bytes), (PageKind::Point, budget.point_page_bytes)];
+                for (kind, bytes) in pages {
                     prop_assert!(layout.pool(kind).frame_bytes >= bytes);
                     prop_assert!(layout.pool(kind).local_frames >= 4);
                 }
                 // Nothing worth a frame of each kind and their tables is left over.
                 let frame = |kind| layout.pool(kind).frame_bytes as u64;
                 let slack = 4 * (frame(PageKind::Node) + frame(PageKind::Point));
-                let tables = 4096 * 80 + 64 * u64::from(layout.pool(PageKind::Node).frames + layout.pool(PageKind::Point).frames);
+                let frames = layout.pool(PageKind::Node).frames + layout.pool(PageKind::Point).frames;
+                let tables = 4096 * 80 + 64 * u64::from(frames);
                 let floor = (slack as f64 / budget.node_share.min(1.0 - budget.node_share)) as u64;
                 let bounded = [PageKind::Node, PageKind::Point].iter().all(|&kind| layout.pool(kind).frames < 1 << 26);
                 prop_assert!(!bounded || budget.bytes - layout.total_bytes() <= floor + tables, "{:?}", layout);

@@ -1,5 +1,6 @@
 //! Owner and views in one process: every promise that needs no second process.
 #![cfg(not(loom))]
+#![allow(clippy::unwrap_used, reason = "a failed step of a test is a failed test")]
 
 mod support;
 
@@ -78,101 +79,6 @@ fn one_view_for_a_slot() {
     owner.reap(0).unwrap();
     assert!(view_of(0).is_ok(), "reaping clears the seat of a worker that died");
     drop(again);
-}
-
-#[test]
-fn foreign_layout_is_refused() {
-    let owner = owner(1, 16, 4, 2);
-    let refused = CacheView::attach(owner.segment().name(), owner.layout().hash() ^ 1, 0);
-    assert!(matches!(
-        refused,
-        Err(CacheError::Mismatch {
-            what: "layout hash",
-            ..
-        })
-    ));
-    let text = refused.unwrap_err().to_string();
-    assert!(text.contains(&format!("{:#x}", owner.layout().hash())), "{text}");
-    for name in [
-        "/pbgi-",
-        "/other",
-        "/pbgi-../../../../etc/passwd",
-        &owner.segment().name()[1..],
-    ] {
-        assert!(
-            matches!(CacheView::attach(name, 0, 0), Err(CacheError::Name { .. })),
-            "{name}"
-        );
-        assert!(matches!(Segment::unlink(name), Err(CacheError::Name { .. })), "{name}");
-        assert!(
-            matches!(Segment::create(name, owner.layout()), Err(CacheError::Name { .. })),
-            "{name}"
-        );
-    }
-}
-
-#[test]
-fn segment_is_private_unique_and_gone_after_drop() {
-    use std::os::unix::fs::MetadataExt;
-    let owner = owner(1, 16, 4, 2);
-    let name = owner.segment().name().to_owned();
-    let path = format!("/dev/shm{name}");
-    let metadata = std::fs::metadata(&path).unwrap();
-    assert_eq!(metadata.mode() & 0o777, 0o600);
-    assert!(metadata.blocks() * 512 >= owner.layout().total_bytes(), "not reserved");
-    assert!(matches!(
-        Segment::create(&name, owner.layout()),
-        Err(CacheError::Exists { .. })
-    ));
-    assert!(owner.segment().linked().unwrap());
-    drop(owner);
-    assert!(std::fs::metadata(&path).is_err());
-    assert!(!Segment::unlink(&name).unwrap());
-}
-
-#[test]
-fn stale_segment_is_unlinked_by_name_and_seen_as_gone() {
-    let owner = owner(2, 16, 4, 2);
-    let mut running = worker(&owner, 0);
-    load(&owner, 0, node(1), 1);
-    assert!(Segment::unlink(owner.segment().name()).unwrap());
-    assert!(!owner.segment().linked().unwrap());
-    check(running.get(node(1)).unwrap(), node(1));
-    load(&owner, 0, node(2), 1);
-    check(running.get(node(2)).unwrap(), node(2));
-    assert!(matches!(
-        CacheView::attach(owner.segment().name(), owner.layout().hash(), 1),
-        Err(CacheError::Os { .. })
-    ));
-    // Somebody else takes the name: it is not ours to remove.
-    let successor = Segment::create(owner.segment().name(), owner.layout()).unwrap();
-    assert!(!owner.segment().linked().unwrap());
-    drop(running);
-    drop(owner);
-    assert!(successor.linked().unwrap());
-}
-
-#[test]
-fn segment_larger_than_the_file_system_is_refused_and_leaves_nothing() {
-    let status = nix::sys::statvfs::statvfs("/dev/shm").unwrap();
-    let size = status.blocks() * status.fragment_size();
-    if size > 1 << 44 {
-        eprintln!("SKIPPED: /dev/shm of {size} bytes is too large to exceed");
-        return;
-    }
-    let layout = CacheBudget::new(size + (64 << 20), 2, 16 << 20, 16 << 20, 4)
-        .plan()
-        .unwrap();
-    assert!(layout.total_bytes() > size);
-    let name = Segment::unique_name().unwrap();
-    match Segment::create(&name, &layout) {
-        Err(CacheError::NoSpace { needed, available }) => {
-            assert_eq!(needed, layout.total_bytes());
-            assert!(available > 0 && available <= size);
-        }
-        other => panic!("{other:?}"),
-    }
-    assert!(!Segment::unlink(&name).unwrap(), "a segment was left");
 }
 
 #[test]
@@ -448,6 +354,68 @@ fn unmount_while_loading_gives_the_frame_back() {
         (0, 0, 0)
     );
     assert_eq!(owner.pins(0, PageKind::Node), 0);
+}
+
+#[test]
+fn scene_on_slow_storage_leaves_loads_to_the_others() {
+    let owner = owner(4, 64, 4, 4);
+    owner.mount(OTHER_MOUNT, &scene(PAGES)).unwrap();
+    let (begun, done) = (Barrier::new(3), Barrier::new(3));
+    let third = AtomicU32::new(0);
+    std::thread::scope(|scope| {
+        for slot in 0..2 {
+            let (owner, begun, done) = (&owner, &begun, &done);
+            scope.spawn(move || {
+                let key = node(u32::from(slot));
+                let load = |page: &mut [u8]| {
+                    begun.wait();
+                    done.wait();
+                    fill(page, key)
+                };
+                owner.fetch(owner.seat(slot).unwrap(), key, 1, load).unwrap();
+            });
+        }
+        begun.wait();
+        scope.spawn(|| {
+            let load = |page: &mut [u8]| {
+                third.store(1, Ordering::Relaxed);
+                fill(page, node(2))
+            };
+            owner.fetch(owner.seat(2).unwrap(), node(2), 1, load).unwrap();
+        });
+        for page in 0..4 {
+            let key = pbgi_core::PageKey {
+                mount: OTHER_MOUNT,
+                ..node(page)
+            };
+            owner
+                .fetch(owner.seat(3).unwrap(), key, 2, |page| fill(page, key))
+                .unwrap();
+        }
+        std::thread::sleep(Duration::from_millis(20));
+        assert_eq!(
+            third.load(Ordering::Relaxed),
+            0,
+            "half of the loads is enough for one scene"
+        );
+        done.wait();
+    });
+    assert_eq!(owner.counters().node.loads, 7);
+}
+
+#[test]
+fn id_of_a_scene_that_is_still_being_loaded_is_not_given_again() {
+    let owner = owner(1, 16, 4, 2);
+    let outcome = owner.fetch(owner.seat(0).unwrap(), point(1), 1, |page| {
+        owner.unmount(MOUNT);
+        assert!(matches!(
+            owner.mount(MOUNT, &scene(PAGES)),
+            Err(CacheError::MountTaken(MOUNT))
+        ));
+        fill(page, point(1))
+    });
+    assert!(matches!(outcome, Err(CacheError::NotMounted(MOUNT))));
+    owner.mount(MOUNT, &scene(PAGES)).unwrap();
 }
 
 #[test]
