@@ -91,7 +91,7 @@ fn texture_transforms_are_those_of_the_extension() {
     assert_eq!(turned(json!({ "offset": [0.5, 0.0] })), [blue, red, white, green]);
     assert_eq!(turned(json!({ "offset": [0.0, 0.5] })), [green, white, red, blue]);
     assert_eq!(turned(json!({ "scale": [-1.0, 1.0] })), [blue, red, white, green]);
-    // A quarter turn counter-clockwise: u' = v, v' = -u (KHR_texture_transform's matrix).
+    // A quarter turn counter-clockwise where v points down: u' = v, v' = -u.
     let quarter = std::f32::consts::FRAC_PI_2;
     assert_eq!(turned(json!({ "rotation": quarter })), [green, red, white, blue]);
 }
