@@ -28,7 +28,10 @@ pub(super) fn open(path: &Path) -> Result<(gltf::Document, Option<Vec<u8>>), Poi
     } else {
         (bytes.as_slice(), None)
     };
-    let gltf = gltf::Gltf::from_slice(json).map_err(|error| {
+    let damaged = |error: gltf::json::Error| PointsError::invalid(path, format!("not a usable glTF file: {error}"));
+    let root: gltf::json::Root = gltf::json::deserialize::from_slice(json).map_err(damaged)?;
+    check_positions(path, &root)?;
+    let document = gltf::Document::from_json(root).map_err(|error| {
         let what = match error {
             gltf::Error::Validation(errors) => match errors.first() {
                 Some((place, error)) => format!("{place} is invalid: {error} ({} such places)", errors.len()),
@@ -38,7 +41,27 @@ pub(super) fn open(path: &Path) -> Result<(gltf::Document, Option<Vec<u8>>), Poi
         };
         PointsError::invalid(path, what)
     })?;
-    Ok((gltf.document, blob))
+    Ok((document, blob))
+}
+
+/// The crate's validation looks these up before it has checked them.
+fn check_positions(path: &Path, root: &gltf::json::Root) -> Result<(), PointsError> {
+    for (index, mesh) in root.meshes.iter().enumerate() {
+        for accessor in mesh
+            .primitives
+            .iter()
+            .flat_map(|primitive| primitive.attributes.values())
+        {
+            if accessor.value() >= root.accessors.len() {
+                let what = format!(
+                    "mesh {index} names accessor {}, which is not in the file",
+                    accessor.value()
+                );
+                return Err(PointsError::invalid(path, what));
+            }
+        }
+    }
+    Ok(())
 }
 
 /// The JSON chunk and the binary chunk.

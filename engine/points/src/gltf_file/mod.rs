@@ -157,11 +157,15 @@ impl Geometry {
                 path: path.to_owned(),
             });
         }
-        let placed = other.positions.iter().map(|&position| {
-            let world = transform.transform_point3(Vec3::from(position).as_dvec3());
-            world.as_vec3().to_array()
-        });
-        self.positions.extend(placed);
+        self.positions.reserve(other.positions.len());
+        for (index, &position) in other.positions.iter().enumerate() {
+            let world = transform.transform_point3(Vec3::from(position).as_dvec3()).as_vec3();
+            if !world.is_finite() {
+                let what = format!("vertex {index} is not finite in world space: {position:?}");
+                return Err(PointsError::invalid(path, what));
+            }
+            self.positions.push(world.to_array());
+        }
         pad(&mut self.normals, &other.normals, base, other.positions.len());
         if let Some(new) = self.normals.get_mut(base..) {
             turn_normals(new, transform.matrix3);
