@@ -37,7 +37,8 @@ impl Machine {
     }
 
     fn limit_share(&self) -> Option<u64> {
-        self.limit_bytes.map(|bytes| (bytes as f64 * limits::LIMIT_SHARE) as u64)
+        self.limit_bytes
+            .map(|bytes| (bytes as f64 * limits::LIMIT_SHARE) as u64)
     }
 }
 
@@ -112,14 +113,21 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
     let wrong = || format!("{text:?} is no size; write for example 512M or 2G");
     let lower = text.trim().to_ascii_lowercase();
     let lower = lower.strip_suffix("ib").or(lower.strip_suffix('b')).unwrap_or(&lower);
-    let unit = lower.bytes().last().and_then(|last| b"kmgt".iter().position(|&unit| unit == last));
+    let unit = lower
+        .bytes()
+        .last()
+        .and_then(|last| b"kmgt".iter().position(|&unit| unit == last));
     let (digits, shift) = match unit {
         Some(unit) => (&lower[..lower.len() - 1], 10 * (unit as i32 + 1)),
         None => (lower, 0),
     };
     let number: f64 = digits.parse().map_err(|_| wrong())?;
     let bytes = number * 2f64.powi(shift);
-    if bytes >= 1.0 && bytes < 2f64.powi(63) { Ok(bytes as u64) } else { Err(wrong()) }
+    if bytes >= 1.0 && bytes < 2f64.powi(63) {
+        Ok(bytes as u64)
+    } else {
+        Err(wrong())
+    }
 }
 
 /// The smallest limit on the way from this process's group to the root; versions 1 and 2.
@@ -134,7 +142,13 @@ fn cgroup_limit(membership: &Path, root: &Path) -> Option<u64> {
             _ => return Vec::new(),
         };
         let group = PathBuf::from(group.trim_start_matches('/'));
-        let limit = |group: &Path| fs::read_to_string(base.join(group).join(file)).ok()?.trim().parse::<u64>().ok();
+        let limit = |group: &Path| {
+            fs::read_to_string(base.join(group).join(file))
+                .ok()?
+                .trim()
+                .parse::<u64>()
+                .ok()
+        };
         group.ancestors().filter_map(limit).collect()
     });
     // Version 1 writes a number near 2^63 for no limit.
@@ -149,7 +163,14 @@ mod tests {
 
     #[test]
     fn sizes_are_read_with_their_units() {
-        for (text, bytes) in [("2G", 2 * G), ("512M", G / 2), ("1.5g", 3 * G / 2), ("64KiB", 65_536), ("1000", 1000), ("1tb", 1024 * G)] {
+        for (text, bytes) in [
+            ("2G", 2 * G),
+            ("512M", G / 2),
+            ("1.5g", 3 * G / 2),
+            ("64KiB", 65_536),
+            ("1000", 1000),
+            ("1tb", 1024 * G),
+        ] {
             assert_eq!(parse_bytes(text), Ok(bytes), "{text}");
         }
         for text in ["", "G", "-1G", "many", "0", "nan", "1e300", "2 G x"] {
@@ -210,7 +231,7 @@ mod tests {
         fs::create_dir_all(root.join("a/b")).unwrap();
         fs::create_dir_all(root.join("memory/old")).unwrap();
         let membership = folder.path().join("cgroup");
-        let mut check = |text: &str, expected| {
+        let check = |text: &str, expected| {
             fs::write(&membership, text).unwrap();
             assert_eq!(cgroup_limit(&membership, &root), expected, "{text}");
         };

@@ -122,7 +122,11 @@ fn build_scene(spec: &Spec) -> Result<BuildReport, String> {
     let mut points = pbgi_points::open_input(&spec.inputs, &options).map_err(|error| error.to_string())?;
     let request = BuildRequest {
         output: spec.output.clone(),
-        overwrite: if spec.overwrite { Overwrite::Replace } else { Overwrite::Refuse },
+        overwrite: if spec.overwrite {
+            Overwrite::Replace
+        } else {
+            Overwrite::Refuse
+        },
         scratch_dir: spec.scratch_dir.clone(),
         memory_bytes: spec.memory_bytes,
         settings: spec.settings,
@@ -140,16 +144,22 @@ fn build_scene(spec: &Spec) -> Result<BuildReport, String> {
                 total: progress.total.unwrap_or(0),
             });
         }
-        if cancelled.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        if cancelled.load(Ordering::Relaxed) {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
     };
-    build(&mut points, &request, &mut observer).map_err(|error| error.to_string())
+    build(points.as_mut(), &request, &mut observer).map_err(|error| error.to_string())
 }
 
 /// Set by SIGTERM. The signal is blocked in every thread and waited for in one, which needs no handler.
 fn cancel_flag() -> Result<Arc<AtomicBool>, String> {
     let mut signals = SigSet::empty();
     signals.add(Signal::SIGTERM);
-    signals.thread_block().map_err(|errno| format!("cannot block SIGTERM: {errno}"))?;
+    signals
+        .thread_block()
+        .map_err(|errno| format!("cannot block SIGTERM: {errno}"))?;
     let flag = Arc::new(AtomicBool::new(false));
     let set = flag.clone();
     let wait = move || {
@@ -177,7 +187,9 @@ fn statistics(report: &BuildReport) -> Statistics {
 }
 
 fn say(report: &Report) -> bool {
-    let Ok(mut line) = serde_json::to_vec(report) else { return false };
+    let Ok(mut line) = serde_json::to_vec(report) else {
+        return false;
+    };
     line.push(b'\n');
     let mut stdout = io::stdout().lock();
     stdout.write_all(&line).and_then(|()| stdout.flush()).is_ok()

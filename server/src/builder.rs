@@ -79,7 +79,12 @@ fn sweep(output: &Path, scratch: &Path) {
     }
 }
 
-async fn follow(dispatcher: &Arc<Dispatcher>, job: JobNo, spec: &Spec, child: BuildChild) -> Result<Statistics, String> {
+async fn follow(
+    dispatcher: &Arc<Dispatcher>,
+    job: JobNo,
+    spec: &Spec,
+    child: BuildChild,
+) -> Result<Statistics, String> {
     let BuildChild {
         mut stdin,
         stdout,
@@ -97,7 +102,7 @@ async fn follow(dispatcher: &Arc<Dispatcher>, job: JobNo, spec: &Spec, child: Bu
     });
     let words = tokio::task::spawn_blocking(move || last_words(stderr));
     let (report, words) = (lines.await, words.await);
-    dispatcher.supervisor.build_hangup(job.0);
+    dispatcher.supervisor.look();
     let status = exit.await.map_err(|_| "the build process was lost".to_owned())?;
     let report = report.map_err(|error| error.to_string())?;
     match report {
@@ -113,7 +118,11 @@ fn read_reports(stdout: ChildStdout, progress: impl Fn(&'static str, u64, u64)) 
     let mut end = None;
     loop {
         let mut line = String::new();
-        match reader.by_ref().take(limits::PROGRESS_LINE_BYTES_MAX).read_line(&mut line) {
+        match reader
+            .by_ref()
+            .take(limits::PROGRESS_LINE_BYTES_MAX)
+            .read_line(&mut line)
+        {
             Ok(0) | Err(_) => return end,
             Ok(_) => {}
         }
@@ -126,7 +135,10 @@ fn read_reports(stdout: ChildStdout, progress: impl Fn(&'static str, u64, u64)) 
 }
 
 fn stage_name(stage: &str) -> &'static str {
-    ["reading", "sorting", "merging", "building"].into_iter().find(|name| *name == stage).unwrap_or("building")
+    ["reading", "sorting", "merging", "building"]
+        .into_iter()
+        .find(|name| *name == stage)
+        .unwrap_or("building")
 }
 
 fn last_words(mut stderr: ChildStderr) -> String {
@@ -143,10 +155,16 @@ fn last_words(mut stderr: ChildStderr) -> String {
 fn death(status: ExitStatus, words: &str) -> String {
     let how = match status.signal() {
         Some(9) => "it was killed, perhaps because memory ran out".to_owned(),
-        Some(6) if words.contains("memory allocation") => "it reached its memory limit; give the daemon more --memory".to_owned(),
+        Some(6) if words.contains("memory allocation") => {
+            "it reached its memory limit; give the daemon more --memory".to_owned()
+        }
         Some(signal) => format!("it died of signal {signal}"),
         None => format!("{status} without a report"),
     };
-    let words = if words.is_empty() { String::new() } else { format!(": {words}") };
+    let words = if words.is_empty() {
+        String::new()
+    } else {
+        format!(": {words}")
+    };
     format!("the build process failed: {how}{words}")
 }

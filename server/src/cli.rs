@@ -125,7 +125,11 @@ struct Folders {
 
 impl Folders {
     fn from_environment() -> Self {
-        let variable = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+        let variable = |name| {
+            std::env::var_os(name)
+                .map(PathBuf::from)
+                .filter(|path| path.is_absolute())
+        };
         let temporary = PathBuf::from(format!("/tmp/pbgi-{}", nix::unistd::geteuid()));
         let home = variable("HOME");
         let below = |name, default: &str| {
@@ -137,7 +141,8 @@ impl Folders {
                 .or_else(|| variable("XDG_RUNTIME_DIR").map(|path| path.join("pbgi")))
                 .unwrap_or_else(|| temporary.clone()),
             state: below("XDG_STATE_HOME", ".local/state").unwrap_or_else(|| temporary.join("state")),
-            scratch: below("XDG_CACHE_HOME", ".cache").map_or_else(|| temporary.join("scratch"), |path| path.join("scratch")),
+            scratch: below("XDG_CACHE_HOME", ".cache")
+                .map_or_else(|| temporary.join("scratch"), |path| path.join("scratch")),
         }
     }
 }

@@ -143,7 +143,10 @@ mod tests {
             (|o| o.workers = 0, "--workers is 0, must be from 1 to 64"),
             (|o| o.workers = 65, "--workers is 65"),
             (|o| o.nodes_per_page = 1, "--nodes-per-page is 1"),
-            (|o| o.runtime_dir = "/tmp".repeat(30).into(), "--runtime-dir is 130 bytes long"),
+            (
+                |o| o.runtime_dir = "/tmp".repeat(30).into(),
+                "--runtime-dir is 130 bytes long",
+            ),
         ];
         for (change, text) in cases {
             let mut options = options();

@@ -170,7 +170,13 @@ fn start(config: &Config, cache: Arc<CacheOwner>) -> Result<(Arc<Dispatcher>, Ha
     let runtime = tokio::runtime::Handle::current();
     let (handle, _) = Supervisor::start(plan, |supervisor| {
         let mounts = Arc::new(Mounts::new(cache.clone()));
-        let dispatcher = Dispatcher::new(config.clone(), cache.clone(), mounts.clone(), supervisor.clone(), runtime);
+        let dispatcher = Dispatcher::new(
+            config.clone(),
+            cache.clone(),
+            mounts.clone(),
+            supervisor.clone(),
+            runtime,
+        );
         let dispatcher = made.insert(Arc::new(dispatcher)).clone();
         Nurse(Loader {
             cache,

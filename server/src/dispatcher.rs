@@ -172,7 +172,12 @@ impl Dispatcher {
     }
 
     /// Runs an event through the scheduler and carries out what follows. Answers to a worker are returned.
-    fn dispatch(self: &Arc<Self>, state: &mut State, event: Event, result: Option<(Vec<u8>, Counters)>) -> Option<Effect> {
+    fn dispatch(
+        self: &Arc<Self>,
+        state: &mut State,
+        event: Event,
+        result: Option<(Vec<u8>, Counters)>,
+    ) -> Option<Effect> {
         let mut result = result;
         let mut answer = None;
         for effect in state.scheduler.on(event, Instant::now()) {
@@ -266,12 +271,11 @@ impl Dispatcher {
         let Some(record) = state.jobs.get_mut(&job) else { return };
         record.shading = None;
         state.outputs.remove(record.request.output());
-        let _entered = record.span.enter();
-        match &end {
+        record.span.in_scope(|| match &end {
             End::Succeeded => tracing::info!("job succeeded"),
             End::Cancelled => tracing::info!("job cancelled"),
             End::Failed(error) => tracing::error!(error, "job failed"),
-        }
+        });
         record.status.send_modify(|status| {
             status.stage = "";
             (status.state, status.error) = match end {
@@ -339,7 +343,10 @@ impl Dispatcher {
             }
             return Ok(());
         }
-        Err(JobError::new(JobErrorKind::Unauthenticated, "not the worker of that seat"))
+        Err(JobError::new(
+            JobErrorKind::Unauthenticated,
+            "not the worker of that seat",
+        ))
     }
 
     /// A tile for a worker; `None` if there is none for some seconds.
@@ -365,7 +372,9 @@ impl Dispatcher {
             return None;
         }
         let granted = self.dispatch(&mut state, Event::Ask { seat }, None)?;
-        let Effect::Grant { lease, job, tile, .. } = granted else { return None };
+        let Effect::Grant { lease, job, tile, .. } = granted else {
+            return None;
+        };
         let record = state.jobs.get(&job)?;
         let receivers = record.shading.as_ref()?.frame.receivers(tile);
         let span = tracing::debug_span!(parent: &record.span, "tile", tile, lease = lease.0, slot = seat.slot, epoch = seat.epoch);
@@ -396,7 +405,9 @@ impl Dispatcher {
         match outcome {
             TileOutcome::Failure(text) => failure = Some(text),
             TileOutcome::Values { values, counters } => {
-                let shading = work.as_ref().and_then(|work| state.jobs.get(&work.job)?.shading.as_ref());
+                let shading = work
+                    .as_ref()
+                    .and_then(|work| state.jobs.get(&work.job)?.shading.as_ref());
                 let checked = match (shading, &work) {
                     (Some(shading), Some(work)) => shading.frame.check(work.tile, &values),
                     // The lease ended, as the scheduler knows.
@@ -434,7 +445,9 @@ impl Dispatcher {
     pub fn tile_span(&self, seat: Seat) -> Span {
         let state = self.lock();
         let sitting = state.seats.get(usize::from(seat.slot)).and_then(Option::as_ref);
-        let work = sitting.filter(|sitting| sitting.birth.seat == seat).and_then(|sitting| sitting.work.as_ref());
+        let work = sitting
+            .filter(|sitting| sitting.birth.seat == seat)
+            .and_then(|sitting| sitting.work.as_ref());
         work.map_or_else(Span::none, |work| work.span.clone())
     }
 }

@@ -11,7 +11,10 @@ pub fn shrink(environment: Environment) -> Environment {
     if factor <= 1 {
         return environment;
     }
-    let (width, height) = (environment.width().div_ceil(factor), environment.height().div_ceil(factor));
+    let (width, height) = (
+        environment.width().div_ceil(factor),
+        environment.height().div_ceil(factor),
+    );
     let weight = |row: u32, rows: u32| {
         let edge = |row: u32| (PI * f64::from(row) / f64::from(rows)).cos();
         edge(row) - edge(row + 1)
@@ -58,7 +61,9 @@ mod tests {
     #[test]
     fn small_maps_stay_and_large_ones_keep_their_light() {
         let map = |width: u32, height: u32| {
-            let pixels = (0..width * height).map(|index| [(index % 97) as f32, (index % 1013) as f32, 1.0]).collect();
+            let pixels = (0..width * height)
+                .map(|index| [(index % 97) as f32, (index % 1013) as f32, 1.0])
+                .collect();
             Environment::new(width, height, pixels).unwrap()
         };
         assert_eq!(shrink(map(512, 256)), map(512, 256));

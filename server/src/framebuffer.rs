@@ -64,7 +64,9 @@ pub struct Planes {
 impl Framebuffer {
     /// Takes a G-buffer; what is not needed for shading is let go.
     pub fn new(gbuffer: GBuffer) -> Self {
-        let holes: Vec<usize> = (0..gbuffer.pixel_count()).filter(|&pixel| gbuffer.is_hole(pixel)).collect();
+        let holes: Vec<usize> = (0..gbuffer.pixel_count())
+            .filter(|&pixel| gbuffer.is_hole(pixel))
+            .collect();
         let GBuffer {
             data_window: data,
             display_window: display,
@@ -144,10 +146,17 @@ impl Framebuffer {
         let receivers: usize = self.groups(tile).map(|group| group.len()).sum();
         let expected = receivers * VALUE_FLOATS * 4;
         if values.len() != expected {
-            return Err(format!("{expected} bytes of values expected, {} received", values.len()));
+            return Err(format!(
+                "{expected} bytes of values expected, {} received",
+                values.len()
+            ));
         }
         match floats(values).position(|value| !value.is_finite()) {
-            Some(index) => Err(format!("value {} of receiver {} is not finite", index % VALUE_FLOATS, index / VALUE_FLOATS)),
+            Some(index) => Err(format!(
+                "value {} of receiver {} is not finite",
+                index % VALUE_FLOATS,
+                index / VALUE_FLOATS
+            )),
             None => Ok(()),
         }
     }
@@ -197,7 +206,10 @@ impl Framebuffer {
             let x = left + i64::from(column * GROUP_EDGE);
             let y = top + i64::from(row * GROUP_EDGE);
             let pixels = self.pixels(x, y);
-            pixels.iter().any(|&pixel| self.second[pixel] != [0.0; 3]).then_some(pixels)
+            pixels
+                .iter()
+                .any(|&pixel| self.second[pixel] != [0.0; 3])
+                .then_some(pixels)
         })
     }
 
@@ -210,7 +222,12 @@ impl Framebuffer {
         let columns = clip(x, self.data.x, self.data.width);
         let rows = clip(y, self.data.y, self.data.height);
         let width = self.data.width as usize;
-        rows.flat_map(|row| columns.clone().map(move |column| row as usize * width + column as usize)).collect()
+        rows.flat_map(|row| {
+            columns
+                .clone()
+                .map(move |column| row as usize * width + column as usize)
+        })
+        .collect()
     }
 }
 
@@ -249,7 +266,9 @@ mod tests {
     /// Position is the pixel's place on the display's plane.
     fn gbuffer(data: Window, display: Window) -> GBuffer {
         let places = (0..data.height as i32).flat_map(|row| (0..data.width as i32).map(move |column| (column, row)));
-        let position: Vec<[f32; 3]> = places.map(|(x, y)| [(x + data.x) as f32, (y + data.y) as f32, 0.0]).collect();
+        let position: Vec<[f32; 3]> = places
+            .map(|(x, y)| [(x + data.x) as f32, (y + data.y) as f32, 0.0])
+            .collect();
         GBuffer {
             data_window: data,
             display_window: display,
@@ -291,7 +310,13 @@ mod tests {
     #[test]
     fn every_pixel_is_sent_once_and_comes_back_to_its_place() {
         let display = window(0, 0, 100, 70);
-        for data in [display, window(-5, -40, 120, 130), window(33, 31, 1, 1), window(7, 9, 64, 40), window(200, 300, 33, 9)] {
+        for data in [
+            display,
+            window(-5, -40, 120, 130),
+            window(33, 31, 1, 1),
+            window(7, 9, 64, 40),
+            window(200, 300, 33, 9),
+        ] {
             let mut frame = Framebuffer::new(gbuffer(data, display));
             assert_eq!(shade(&mut frame), data.pixel_count());
             let planes = frame.into_planes();
@@ -354,7 +379,13 @@ mod tests {
     #[test]
     fn values_that_are_not_finite_are_refused() {
         let frame = Framebuffer::new(gbuffer(window(0, 0, 1, 1), window(0, 0, 1, 1)));
-        let values: Vec<u8> = [0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0, 0.0].into_iter().flat_map(f32::to_le_bytes).collect();
-        assert_eq!(frame.check(0, &values).unwrap_err(), "value 2 of receiver 0 is not finite");
+        let values: Vec<u8> = [0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0, 0.0]
+            .into_iter()
+            .flat_map(f32::to_le_bytes)
+            .collect();
+        assert_eq!(
+            frame.check(0, &values).unwrap_err(),
+            "value 2 of receiver 0 is not finite"
+        );
     }
 }

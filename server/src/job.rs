@@ -73,7 +73,10 @@ impl Request {
                 task.settings.validate().map_err(invalid)?;
                 if task.inputs.is_empty() || task.inputs.len() > limits::BUILD_INPUTS_MAX {
                     let max = limits::BUILD_INPUTS_MAX;
-                    return Err(JobError::invalid(format!("{} inputs given, must be 1 to {max}", task.inputs.len())));
+                    return Err(JobError::invalid(format!(
+                        "{} inputs given, must be 1 to {max}",
+                        task.inputs.len()
+                    )));
                 }
                 match task.density {
                     Density::Spacing(spacing) if !(spacing > 0.0 && spacing.is_finite()) => {
@@ -88,7 +91,9 @@ impl Request {
                 task.settings.validate().map_err(invalid)?;
                 check_path("scene", &task.scene)?;
                 check_path("gbuffer", &task.gbuffer)?;
-                task.environment.iter().try_for_each(|path| check_path("environment", path))
+                task.environment
+                    .iter()
+                    .try_for_each(|path| check_path("environment", path))
             }
         }?;
         check_path("output", self.output())
@@ -148,7 +153,9 @@ pub fn check_job_id(id: &str) -> Result<(), JobError> {
     let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"._-".contains(&byte);
     if id.is_empty() || id.len() > limits::JOB_ID_CHARS_MAX || !id.bytes().all(allowed) {
         let max = limits::JOB_ID_CHARS_MAX;
-        return Err(JobError::invalid(format!("job id must be 1 to {max} characters of A-Z a-z 0-9 . _ -")));
+        return Err(JobError::invalid(format!(
+            "job id must be 1 to {max} characters of A-Z a-z 0-9 . _ -"
+        )));
     }
     Ok(())
 }
@@ -200,7 +207,10 @@ pub struct JobStatus {
 
 /// The error for a job that is not there.
 pub fn no_such_job(id: &str) -> JobError {
-    JobError::new(JobErrorKind::NotFound, format!("no job {id:?}: it never was, or ended long ago"))
+    JobError::new(
+        JobErrorKind::NotFound,
+        format!("no job {id:?}: it never was, or ended long ago"),
+    )
 }
 
 #[cfg(test)]

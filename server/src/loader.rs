@@ -99,7 +99,8 @@ impl Loader {
 
     fn fetch(&self, seat: Seat, key: PageKey, job: u64) -> Result<Fetched, CacheError> {
         let mount = self.mounts.get(key.mount).ok_or(CacheError::NotMounted(key.mount))?;
-        self.cache.fetch(cache_seat(seat), key, job, |page| read(&mount, key, page))
+        self.cache
+            .fetch(cache_seat(seat), key, job, |page| read(&mount, key, page))
     }
 }
 

@@ -118,7 +118,9 @@ fn init_tracing(arguments: &ServeArguments) -> Result<(), ServerError> {
         value: arguments.log.clone(),
         expected: format!("a filter like info or pbgi_server=debug ({error})"),
     })?;
-    let subscriber = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    let subscriber = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr);
     match arguments.log_format {
         LogFormat::Text => subscriber.with_ansi(false).init(),
         LogFormat::Json => subscriber.json().init(),

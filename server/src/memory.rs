@@ -28,7 +28,10 @@ mod tests {
 
     #[test]
     fn kilobytes_are_read() {
-        assert_eq!(parse("Name:\tx\nRssAnon:\t    1024 kB\nRssFile:\t 5 kB\n"), Some(1 << 20));
+        assert_eq!(
+            parse("Name:\tx\nRssAnon:\t    1024 kB\nRssFile:\t 5 kB\n"),
+            Some(1 << 20)
+        );
         assert_eq!(parse("Name:\tx\n"), None);
     }
 }

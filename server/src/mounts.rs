@@ -106,9 +106,13 @@ impl Mounts {
         state.clock += 1;
         let now = state.clock;
         let same_path = |entry: &&mut Entry| entry.mount.path == path;
-        if let Some(entry) = state.seats.iter_mut().flatten().filter(same_path).find(|entry| {
-            entry.mount.scene.info().build_id == build_id
-        }) {
+        if let Some(entry) = state
+            .seats
+            .iter_mut()
+            .flatten()
+            .filter(same_path)
+            .find(|entry| entry.mount.scene.info().build_id == build_id)
+        {
             entry.used = now;
             return Ok(Mounted(entry.mount.clone()));
         }
@@ -122,7 +126,9 @@ impl Mounts {
             slot: slot as u8,
             generation: state.generations[slot],
         };
-        self.cache.mount(id, scene.info()).map_err(|error| cannot_mount(&error, &path))?;
+        self.cache
+            .mount(id, scene.info())
+            .map_err(|error| cannot_mount(&error, &path))?;
         tracing::info!(slot, generation = id.generation, %build_id, path = %path.display(), "scene mounted");
         let pages_loaded = AtomicU64::new(0);
         let mount = Arc::new(Mount {
@@ -200,5 +206,8 @@ fn cannot_mount(error: &CacheError, path: &Path) -> JobError {
         }
         _ => "",
     };
-    JobError::new(JobErrorKind::Precondition, format!("{error}{remedy}, at {}", path.display()))
+    JobError::new(
+        JobErrorKind::Precondition,
+        format!("{error}{remedy}, at {}", path.display()),
+    )
 }

@@ -27,14 +27,19 @@ pub struct Picture {
 /// A text for people: a name that is taken, a disk that is full, or `stopped` said so.
 pub fn write(picture: &Picture, planes: Planes, stopped: &dyn Fn() -> bool) -> Result<u64, String> {
     let task = &picture.task;
-    let overwrite = if task.overwrite { Overwrite::Replace } else { Overwrite::Refuse };
+    let overwrite = if task.overwrite {
+        Overwrite::Replace
+    } else {
+        Overwrite::Refuse
+    };
     let text = |error: StoreError| error.to_string();
     let mut file = AtomicFile::create(&task.output, overwrite).map_err(text)?;
     let image = layered(picture, planes);
     let encoded = Encoded(picture.scratch.join(format!("picture-{}.exr", unique())));
     image.write_exr(&encoded.0).map_err(|error| error.to_string())?;
     drop(image);
-    let bytes = copy(&encoded.0, &mut file).map_err(|error| format!("cannot write picture: {error}, at {}", task.output.display()))?;
+    let bytes = copy(&encoded.0, &mut file)
+        .map_err(|error| format!("cannot write picture: {error}, at {}", task.output.display()))?;
     if stopped() {
         return Err("stopped".into());
     }
@@ -58,7 +63,9 @@ pub fn sweep(scratch: &Path) -> io::Result<usize> {
     for entry in fs::read_dir(scratch)? {
         let entry = entry?;
         let name = entry.file_name();
-        let ours = name.to_str().is_some_and(|name| name.starts_with("picture-") && name.contains(".exr"));
+        let ours = name
+            .to_str()
+            .is_some_and(|name| name.starts_with("picture-") && name.contains(".exr"));
         if ours && entry.file_type()?.is_file() && fs::remove_file(entry.path()).is_ok() {
             count += 1;
         }
@@ -162,7 +169,10 @@ mod tests {
         let bytes = write(&picture, planes(), &|| false).unwrap();
         assert_eq!(fs::metadata(&picture.task.output).unwrap().len(), bytes);
         let image = LayeredImage::read_exr(&picture.task.output).unwrap();
-        assert_eq!((image.data_window, image.display_window), (planes().data, planes().display));
+        assert_eq!(
+            (image.data_window, image.display_window),
+            (planes().data, planes().display)
+        );
         assert_eq!(image.triple("indirect").unwrap(), planes().irradiance);
         assert_eq!(image.triple("").unwrap(), planes().irradiance);
         assert_eq!(image.triple("bentnormal").unwrap(), planes().bent_normal);

@@ -14,9 +14,14 @@ const LOG_BYTES_MAX: u64 = 16 << 20;
 pub(crate) fn leave_the_session() {
     // Fails only for the leader of a group, which is on its own already.
     let _ = setsid();
-    let Ok(entries) = fs::read_dir("/proc/self/fd") else { return };
+    let Ok(entries) = fs::read_dir("/proc/self/fd") else {
+        return;
+    };
     let number = |entry: std::io::Result<fs::DirEntry>| entry.ok()?.file_name().to_str()?.parse::<i32>().ok();
-    let inherited: Vec<i32> = entries.filter_map(number).filter(|&descriptor| descriptor > 2).collect();
+    let inherited: Vec<i32> = entries
+        .filter_map(number)
+        .filter(|&descriptor| descriptor > 2)
+        .collect();
     for descriptor in inherited {
         // The listing's own descriptor is closed by now.
         let _ = close(descriptor);
@@ -38,7 +43,12 @@ pub(crate) fn log_to(path: &Path) -> Result<(), ServerError> {
     if fs::metadata(path).is_ok_and(|metadata| metadata.len() > LOG_BYTES_MAX) {
         fs::rename(path, path.with_extension("log.1")).map_err(io)?;
     }
-    let log = OpenOptions::new().create(true).append(true).mode(0o600).open(path).map_err(io)?;
+    let log = OpenOptions::new()
+        .create(true)
+        .append(true)
+        .mode(0o600)
+        .open(path)
+        .map_err(io)?;
     dup2_stderr(&log).map_err(|errno| io(errno.into()))?;
     let null = File::open("/dev/null").map_err(io)?;
     dup2_stdin(&null).map_err(|errno| io(errno.into()))

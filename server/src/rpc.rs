@@ -57,7 +57,11 @@ pub async fn serve_jobs(
     let mut healthy = dispatcher.health();
     let report = tokio::spawn(async move {
         loop {
-            let status = if *healthy.borrow_and_update() { ServingStatus::Serving } else { ServingStatus::NotServing };
+            let status = if *healthy.borrow_and_update() {
+                ServingStatus::Serving
+            } else {
+                ServingStatus::NotServing
+            };
             for name in CLIENT_SERVICES.into_iter().chain([""]) {
                 health.set_service_status(name, status).await;
             }
@@ -70,7 +74,10 @@ pub async fn serve_jobs(
         let builder = tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(pbgi_proto::FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET);
-        CLIENT_SERVICES.into_iter().chain(["grpc.health.v1.Health"]).fold(builder, |b, name| b.with_service_name(name))
+        CLIENT_SERVICES
+            .into_iter()
+            .chain(["grpc.health.v1.Health"])
+            .fold(builder, |b, name| b.with_service_name(name))
     };
     let setup = |error: tonic_reflection::server::Error| ServerError::Setup {
         action: "set up reflection",
@@ -82,7 +89,11 @@ pub async fn serve_jobs(
         .add_service(reflection().build_v1().map_err(setup)?)
         // Python's reflection client speaks this one only.
         .add_service(reflection().build_v1alpha().map_err(setup)?)
-        .add_service(JobServiceServer::new(service.clone()).max_decoding_message_size(limit).max_encoding_message_size(limit))
+        .add_service(
+            JobServiceServer::new(service.clone())
+                .max_decoding_message_size(limit)
+                .max_encoding_message_size(limit),
+        )
         .add_service(SceneServiceServer::new(service.clone()).max_decoding_message_size(limit))
         .add_service(DaemonServiceServer::new(service).max_decoding_message_size(limit))
         .serve_with_incoming_shutdown(connections(listener), async move {
@@ -107,7 +118,11 @@ pub async fn serve_queue(
     let service = QueueServiceServer::new(queue::Queue::new(dispatcher));
     server()
         .layer(InterceptorLayer::new(check_peer))
-        .add_service(service.max_decoding_message_size(limit).max_encoding_message_size(limit))
+        .add_service(
+            service
+                .max_decoding_message_size(limit)
+                .max_encoding_message_size(limit),
+        )
         .serve_with_incoming_shutdown(connections(listener), async move {
             // An error means that the daemon is gone.
             let _ = stop.wait_for(|stop| *stop).await;

@@ -90,7 +90,9 @@ pub async fn prepare(
     let (mounts, task) = (dispatcher.mounts.clone(), task.clone());
     let read = tokio::task::spawn_blocking(move || read(&mounts, &task)).await;
     let (frame, mounted, environment) = read.map_err(|error| error.to_string())??;
-    let megabytes = (frame.pixel_count() * limits::PICTURE_BYTES_PER_PIXEL).div_ceil(1 << 20).max(1);
+    let megabytes = (frame.pixel_count() * limits::PICTURE_BYTES_PER_PIXEL)
+        .div_ceil(1 << 20)
+        .max(1);
     let available = dispatcher.config.memory.work_bytes >> 20;
     if megabytes > available {
         return Err(format!(
@@ -138,7 +140,9 @@ fn read(mounts: &Mounts, task: &ShadeTask) -> Result<Ingredients, String> {
     let pixels = gbuffer.pixel_count() as u64;
     if pixels > IMAGE_PIXELS_MAX {
         let path = task.gbuffer.display();
-        return Err(format!("picture of {pixels} pixels, at most {IMAGE_PIXELS_MAX} are shaded, in {path}"));
+        return Err(format!(
+            "picture of {pixels} pixels, at most {IMAGE_PIXELS_MAX} are shaded, in {path}"
+        ));
     }
     Ok((Framebuffer::new(gbuffer), mounted, environment))
 }
@@ -165,7 +169,9 @@ pub async fn write(
         statistics: statistics.clone(),
         scratch: dispatcher.config.options.scratch_dir.clone(),
     };
-    let Shading { frame, _memory: memory, .. } = shading;
+    let Shading {
+        frame, _memory: memory, ..
+    } = shading;
     let written = tokio::task::spawn_blocking(move || {
         let written = output::write(&picture, frame.into_planes(), &|| *abort.borrow());
         drop(memory);

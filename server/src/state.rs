@@ -37,7 +37,8 @@ impl StateDir {
             Ok(lock) => lock,
             Err((mut file, nix::errno::Errno::EWOULDBLOCK)) => {
                 let mut pid = String::new();
-                let known = file.by_ref().take(32).read_to_string(&mut pid).is_ok() && !pid.trim().is_empty();
+                let read = Read::by_ref(&mut file).take(32).read_to_string(&mut pid);
+                let known = read.is_ok() && !pid.trim().is_empty();
                 let holder = if known {
                     format!("pbgi-server with process id {}", pid.trim())
                 } else {
@@ -123,7 +124,11 @@ pub fn make_directories(paths: &[&Path]) -> Result<(), ServerError> {
             problems.push(format!("cannot use directory: {error}, at {}", path.display()));
         }
     }
-    if problems.is_empty() { Ok(()) } else { Err(ServerError::Directories(problems)) }
+    if problems.is_empty() {
+        Ok(())
+    } else {
+        Err(ServerError::Directories(problems))
+    }
 }
 
 #[cfg(test)]
@@ -136,7 +141,12 @@ mod tests {
         let first = StateDir::take(folder.path()).unwrap();
         let error = StateDir::take(folder.path()).unwrap_err();
         assert_eq!(error.exit_code(), 2);
-        assert!(error.to_string().contains(&format!("process id {}", std::process::id())), "{error}");
+        assert!(
+            error
+                .to_string()
+                .contains(&format!("process id {}", std::process::id())),
+            "{error}"
+        );
         drop(first);
         StateDir::take(folder.path()).unwrap();
     }

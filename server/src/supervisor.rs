@@ -62,8 +62,8 @@ enum Command {
     Build(BuildOrder),
     /// End a build child.
     StopBuild(u64),
-    /// A build child's output closed.
-    BuildHangup(u64),
+    /// A child seems to have ended: look now.
+    Look,
     /// Try parked slots again.
     Unpark,
     /// Kill and reap everything; no more is started.
@@ -157,9 +157,9 @@ impl Handle {
         self.send(Command::StopBuild(id));
     }
 
-    /// A build child's output closed.
-    pub fn build_hangup(&self, id: u64) {
-        self.send(Command::BuildHangup(id));
+    /// A build child's output closed: it is about to end.
+    pub fn look(&self) {
+        self.send(Command::Look);
     }
 
     /// Kills and reaps every child; returns when that is done.
@@ -225,7 +225,9 @@ impl<N: Nursery + 'static> Supervisor<N> {
 
     fn pause(&self, now: Instant) -> Duration {
         let spawn = self.slots.iter().filter_map(Slot::spawn_at).min();
-        let pause = spawn.map_or(limits::REAP_POLL, |at| at.saturating_duration_since(now).min(limits::REAP_POLL));
+        let pause = spawn.map_or(limits::REAP_POLL, |at| {
+            at.saturating_duration_since(now).min(limits::REAP_POLL)
+        });
         if self.stopping { limits::BACKOFF[1] } else { pause }
     }
 
@@ -248,7 +250,7 @@ impl<N: Nursery + 'static> Supervisor<N> {
                 let now = Instant::now();
                 self.slots.iter_mut().for_each(|slot| slot.unpark(now));
             }
-            Command::BuildHangup(_) | Command::Stop(_) => {}
+            Command::Look | Command::Stop(_) => {}
         }
     }
 

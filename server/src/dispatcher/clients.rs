@@ -53,7 +53,10 @@ impl Dispatcher {
             return Err(JobError::new(JobErrorKind::Unavailable, crate::scheduler::DRAINING));
         }
         if state.scheduler.counts().0 >= limits::JOBS_QUEUED_MAX {
-            let text = format!("{} jobs wait already; try again when some have ended", limits::JOBS_QUEUED_MAX);
+            let text = format!(
+                "{} jobs wait already; try again when some have ended",
+                limits::JOBS_QUEUED_MAX
+            );
             return Err(JobError::new(JobErrorKind::Exhausted, text));
         }
         if !state.outputs.insert(request.output().to_owned()) {
@@ -113,13 +116,20 @@ impl Dispatcher {
     pub fn watch(&self, id: &str) -> Result<watch::Receiver<JobStatus>, JobError> {
         let state = self.lock();
         let record = state.names.get(id).and_then(|number| state.jobs.get(number));
-        record.map(|record| record.status.subscribe()).ok_or_else(|| no_such_job(id))
+        record
+            .map(|record| record.status.subscribe())
+            .ok_or_else(|| no_such_job(id))
     }
 
     /// All jobs that are remembered, newest first.
     pub fn jobs(&self) -> Vec<JobStatus> {
         let state = self.lock();
-        state.jobs.values().rev().map(|record| record.status.borrow().clone()).collect()
+        state
+            .jobs
+            .values()
+            .rev()
+            .map(|record| record.status.borrow().clone())
+            .collect()
     }
 
     /// Stops a job. One that has ended stays as it is.
@@ -131,7 +141,9 @@ impl Dispatcher {
         let job = *state.names.get(id).ok_or_else(|| no_such_job(id))?;
         self.dispatch(&mut state, Event::Cancel { job }, None);
         let record = state.jobs.get(&job);
-        record.map(|record| record.status.borrow().clone()).ok_or_else(|| no_such_job(id))
+        record
+            .map(|record| record.status.borrow().clone())
+            .ok_or_else(|| no_such_job(id))
     }
 
     /// Opens, mounts and describes a scene.
@@ -147,7 +159,12 @@ impl Dispatcher {
 
     /// The daemon.
     pub fn status(&self) -> DaemonStatus {
-        let pins = |slot| [PageKind::Node, PageKind::Point].map(|kind| self.cache.pins(slot, kind)).iter().sum();
+        let pins = |slot| {
+            [PageKind::Node, PageKind::Point]
+                .map(|kind| self.cache.pins(slot, kind))
+                .iter()
+                .sum()
+        };
         let (cache, mounts) = (self.cache.counters(), self.mounts.list());
         let state = self.lock();
         let worker = |sitting: &super::Sitting| {
@@ -184,7 +201,9 @@ impl Dispatcher {
     /// Tells watchers how far a job is.
     pub(crate) fn progress(&self, job: JobNo, stage: &'static str, done: u64, total: u64) {
         if let Some(record) = self.lock().jobs.get(&job) {
-            record.status.send_modify(|status| (status.stage, status.done, status.total) = (stage, done, total));
+            record
+                .status
+                .send_modify(|status| (status.stage, status.done, status.total) = (stage, done, total));
         }
     }
 }

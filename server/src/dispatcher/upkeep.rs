@@ -63,7 +63,10 @@ impl Dispatcher {
     pub(crate) fn peaks(&self, job: JobNo) -> (u64, u64) {
         self.sample_memory();
         let state = self.lock();
-        state.jobs.get(&job).map_or((0, 0), |record| (record.memory_peak_bytes, record.cache_peak_bytes))
+        state
+            .jobs
+            .get(&job)
+            .map_or((0, 0), |record| (record.memory_peak_bytes, record.cache_peak_bytes))
     }
 
     pub(crate) fn build_started(&self, job: JobNo, pid: u32) {

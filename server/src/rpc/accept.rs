@@ -29,7 +29,9 @@ pub(super) fn connections(listener: UnixListener) -> ReceiverStream<io::Result<C
         let places = Arc::new(Semaphore::new(limits::CONNECTIONS_MAX));
         let [mut pause, pause_max] = limits::ACCEPT_BACKOFF;
         loop {
-            let Ok(place) = places.clone().acquire_owned().await else { return };
+            let Ok(place) = places.clone().acquire_owned().await else {
+                return;
+            };
             let accepted = tokio::select! {
                 accepted = listener.accept() => accepted,
                 () = sender.closed() => return,
@@ -56,7 +58,10 @@ pub(super) fn connections(listener: UnixListener) -> ReceiverStream<io::Result<C
 /// Lets in our own user only.
 #[expect(clippy::result_large_err, reason = "the interceptor's signature is tonic's")]
 pub(super) fn check_peer(request: Request<()>) -> Result<Request<()>, Status> {
-    let peer = request.extensions().get::<UdsConnectInfo>().and_then(|info| info.peer_cred);
+    let peer = request
+        .extensions()
+        .get::<UdsConnectInfo>()
+        .and_then(|info| info.peer_cred);
     let own = nix::unistd::geteuid().as_raw();
     match peer.map(|peer| peer.uid()) {
         Some(uid) if uid == own => Ok(request),

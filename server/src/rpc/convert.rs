@@ -109,7 +109,11 @@ pub(super) fn scene(info: &SceneInfo) -> v1::SceneInfo {
 
 pub(super) fn task(task: &TaskInfo) -> v1::Task {
     let settings = &task.settings;
-    let pixels = task.environment.iter().flat_map(|environment| environment.pixels()).flatten();
+    let pixels = task
+        .environment
+        .iter()
+        .flat_map(|environment| environment.pixels())
+        .flatten();
     v1::Task {
         scene: Some(scene(&task.scene)),
         mount_slot: task.mount.slot.into(),
@@ -145,13 +149,16 @@ pub(super) fn counters(counters: Option<v1::TileCounters>) -> Counters {
 
 pub(super) fn daemon(status: DaemonStatus) -> v1::DaemonStatus {
     let small = |value: u64| u32::try_from(value).unwrap_or(u32::MAX);
-    let workers = status.workers.into_iter().map(|(birth, busy, frames_pinned)| v1::WorkerStatus {
-        slot: birth.seat.slot.into(),
-        epoch: birth.seat.epoch,
-        pid: birth.pid,
-        busy,
-        frames_pinned,
-    });
+    let workers = status
+        .workers
+        .into_iter()
+        .map(|(birth, busy, frames_pinned)| v1::WorkerStatus {
+            slot: birth.seat.slot.into(),
+            epoch: birth.seat.epoch,
+            pid: birth.pid,
+            busy,
+            frames_pinned,
+        });
     let mounts = status.mounts.into_iter().map(|mount| v1::MountStatus {
         scene: mount.path.to_string_lossy().into_owned(),
         build_id: mount.build_id.to_string(),

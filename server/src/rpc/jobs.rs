@@ -84,7 +84,11 @@ async fn forward(mut job: watch::Receiver<JobStatus>, sender: mpsc::Sender<Resul
 #[tonic::async_trait]
 impl SceneService for Jobs {
     async fn get_scene(&self, request: Request<v1::GetSceneRequest>) -> Result<Response<v1::SceneInfo>, Status> {
-        let info = self.dispatcher.scene(request.into_inner().scene.into()).await.map_err(status)?;
+        let info = self
+            .dispatcher
+            .scene(request.into_inner().scene.into())
+            .await
+            .map_err(status)?;
         Ok(Response::new(convert::scene(&info)))
     }
 }

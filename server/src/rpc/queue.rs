@@ -112,7 +112,13 @@ mod tests {
         let bytes = token_bytes(digits).unwrap();
         assert_eq!((bytes[0], bytes[1], bytes[15]), (0x00, 0x11, 0xff));
         let plus = b"+0112233445566778899aabbccddeeff";
-        for bad in [&b""[..], b"00", &digits[1..], plus, b"00112233445566778899aabbccddeeff00"] {
+        for bad in [
+            &b""[..],
+            b"00",
+            &digits[1..],
+            plus,
+            b"00112233445566778899aabbccddeeff00",
+        ] {
             assert_eq!(token_bytes(bad), None);
         }
     }

@@ -21,9 +21,16 @@ pub(super) struct Slot {
 }
 
 enum State {
-    Empty { spawn_at: Instant },
-    Taken { worker: Worker },
-    Parked { since: Instant, reason: String },
+    Empty {
+        spawn_at: Instant,
+    },
+    Taken {
+        worker: Worker,
+    },
+    Parked {
+        since: Instant,
+        reason: String,
+    },
     /// Nobody comes any more.
     Closed,
 }
@@ -89,7 +96,12 @@ impl Slot {
         {
             if !own {
                 worker.killed = true;
-                tracing::warn!(slot = seat.slot, epoch = seat.epoch, pid = worker.child.id(), "killing worker");
+                tracing::warn!(
+                    slot = seat.slot,
+                    epoch = seat.epoch,
+                    pid = worker.child.id(),
+                    "killing worker"
+                );
             }
             kill_now(worker.child.id());
         }
@@ -120,7 +132,11 @@ impl Slot {
     /// A worker died before it was ready, or could not be made.
     fn failed(&mut self, now: Instant, reason: String) {
         self.failures.push_back(now);
-        while self.failures.front().is_some_and(|&first| now.duration_since(first) > limits::PARK_WINDOW) {
+        while self
+            .failures
+            .front()
+            .is_some_and(|&first| now.duration_since(first) > limits::PARK_WINDOW)
+        {
             self.failures.pop_front();
         }
         if self.failures.len() >= limits::PARK_DEATHS {
@@ -135,7 +151,9 @@ impl Slot {
     }
 
     pub(super) fn reap(&mut self, nursery: &mut impl Nursery, now: Instant) {
-        let State::Taken { worker } = &mut self.state else { return };
+        let State::Taken { worker } = &mut self.state else {
+            return;
+        };
         let status = match worker.child.try_wait() {
             Ok(None) => return,
             Ok(Some(status)) => Some(status),
@@ -149,10 +167,18 @@ impl Slot {
 
     fn buried(&mut self, nursery: &mut impl Nursery, status: Option<ExitStatus>, now: Instant) {
         let empty = State::Empty { spawn_at: now };
-        let State::Taken { worker } = std::mem::replace(&mut self.state, empty) else { return };
+        let State::Taken { worker } = std::mem::replace(&mut self.state, empty) else {
+            return;
+        };
         let status = status.map_or_else(|| "unknown".to_owned(), |status| status.to_string());
         let death = if worker.killed { Death::Killed } else { Death::Own };
-        tracing::warn!(slot = worker.seat.slot, epoch = worker.seat.epoch, status, ?death, "worker died");
+        tracing::warn!(
+            slot = worker.seat.slot,
+            epoch = worker.seat.epoch,
+            status,
+            ?death,
+            "worker died"
+        );
         nursery.dead(worker.seat, death);
         if !worker.ready {
             self.failed(now, format!("the worker ended before it was ready: {status}"));

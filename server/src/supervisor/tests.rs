@@ -74,21 +74,41 @@ fn wait<T>(witness: &Witness, what: &str, mut found: impl FnMut(&mut Log) -> Opt
 fn dead_worker_is_reaped_and_its_slot_filled_with_a_new_epoch() {
     let folder = tempfile::tempdir().unwrap();
     let (handle, witness) = start(&sleeper(folder.path()), 2);
-    let births = wait(&witness, "births", |log| (log.births.len() == 2).then(|| log.births[0].0));
+    let births = wait(&witness, "births", |log| {
+        (log.births.len() == 2).then(|| log.births[0].0)
+    });
     handle.ready(births.seat);
     handle.kill(births.seat);
     let (seat, death) = wait(&witness, "death", |log| log.deaths.first().copied());
     assert_eq!((seat, death), (births.seat, Death::Killed));
     let third = wait(&witness, "third birth", |log| log.births.get(2).map(|birth| birth.0));
-    assert_eq!(third.seat, Seat { slot: seat.slot, epoch: 2 });
+    assert_eq!(
+        third.seat,
+        Seat {
+            slot: seat.slot,
+            epoch: 2
+        }
+    );
     assert_ne!(third.token, births.token);
     // A kill meant for the old worker does not hit the new one.
     handle.kill(births.seat);
     handle.stop();
-    let deaths = wait(&witness, "deaths", |log| (log.deaths.len() == 3).then(|| log.deaths.clone()));
+    let deaths = wait(&witness, "deaths", |log| {
+        (log.deaths.len() == 3).then(|| log.deaths.clone())
+    });
     assert!(deaths.contains(&(third.seat, Death::Killed)), "{deaths:?}");
-    let pids: Vec<u32> = witness.0.lock().unwrap().births.iter().map(|birth| birth.0.pid).collect();
-    assert!(pids.iter().all(|pid| crate::memory::anonymous_bytes(*pid).is_none()), "a child is left");
+    let pids: Vec<u32> = witness
+        .0
+        .lock()
+        .unwrap()
+        .births
+        .iter()
+        .map(|birth| birth.0.pid)
+        .collect();
+    assert!(
+        pids.iter().all(|pid| crate::memory::anonymous_bytes(*pid).is_none()),
+        "a child is left"
+    );
 }
 
 #[test]
@@ -105,6 +125,9 @@ fn workers_that_never_get_ready_park_their_slot_after_five_deaths() {
 fn missing_worker_program_is_named() {
     let (handle, witness) = start(Path::new("/nowhere/worker"), 1);
     let (_, reason) = wait(&witness, "parking", |log| log.parked.clone());
-    assert!(reason.contains("cannot start /nowhere/worker: No such file"), "{reason}");
+    assert!(
+        reason.contains("cannot start /nowhere/worker: No such file"),
+        "{reason}"
+    );
     handle.stop();
 }
