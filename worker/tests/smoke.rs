@@ -1,4 +1,5 @@
 //! The program as people may meet it: started by hand, it says that it is not for them.
+#![allow(clippy::unwrap_used, reason = "tests assert")]
 
 use std::process::{Command, Stdio};
 

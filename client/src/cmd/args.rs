@@ -20,7 +20,7 @@ pub(crate) struct ServerArgs {
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, conflicts_with = "server")]
     pub(crate) memory: Option<u64>,
     /// Worker processes of the private daemon; with --server, most workers for this job
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=limits::WORKERS_MAX as i64))]
+    #[arg(long, allow_negative_numbers = true, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=limits::WORKERS_MAX as i64))]
     pub(crate) workers: Option<u32>,
 }
 
@@ -80,10 +80,10 @@ impl StatsArgs {
 #[command(next_help_heading = "Sampling of meshes")]
 pub(crate) struct DensityArgs {
     /// Number of points on all surfaces together
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..), conflicts_with = "spacing")]
+    #[arg(long, allow_negative_numbers = true, value_name = "N", value_parser = clap::value_parser!(u64).range(1..), conflicts_with = "spacing")]
     pub(crate) points: Option<u64>,
     /// Distance between neighbouring points, world units
-    #[arg(long, value_name = "D", value_parser = positive)]
+    #[arg(long, allow_negative_numbers = true, value_name = "D", value_parser = positive)]
     pub(crate) spacing: Option<f32>,
 }
 
@@ -99,19 +99,19 @@ impl DensityArgs {
 #[command(next_help_heading = "Shading")]
 pub(crate) struct QualityArgs {
     /// Largest solid angle of a cut element, steradian: smaller is finer and slower [default: 0.05]
-    #[arg(long, value_name = "SR")]
+    #[arg(long, allow_negative_numbers = true, value_name = "SR")]
     pub(crate) max_solid_angle: Option<f32>,
     /// Rows and columns of the raster: 8, 16, 32 or 64 [default: 64]
-    #[arg(long, value_name = "N")]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
     pub(crate) raster_resolution: Option<u32>,
     /// Distance beyond which surfaces do not occlude, world units; acts on occlusion and bent normal [default: unlimited]
-    #[arg(long, value_name = "D")]
+    #[arg(long, allow_negative_numbers = true, value_name = "D")]
     pub(crate) max_dist: Option<f32>,
     /// How fast occlusion fades with distance d: exp(-falloff d) [default: 0]
-    #[arg(long, value_name = "F")]
+    #[arg(long, allow_negative_numbers = true, value_name = "F")]
     pub(crate) falloff: Option<f32>,
     /// Surfaces within this fraction of a point's radius are the receiver's own [default: 0.1]
-    #[arg(long, value_name = "B")]
+    #[arg(long, allow_negative_numbers = true, value_name = "B")]
     pub(crate) bias: Option<f32>,
     /// Light probe around the scene: a latitude-longitude .hdr or .exr, y up [default: black]
     #[arg(long, value_name = "FILE")]
@@ -138,16 +138,16 @@ impl QualityArgs {
 #[command(next_help_heading = "Octree")]
 pub(crate) struct OctreeArgs {
     /// Most points in a leaf [default: 16]
-    #[arg(long, value_name = "N")]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
     pub(crate) leaf_max: Option<u32>,
     /// Levels written together; 0 writes siblings as soon as their parent is known [default: 3]
-    #[arg(long, value_name = "N")]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
     pub(crate) chunk_levels: Option<u32>,
     /// Nodes in a page [default: 256]
-    #[arg(long, value_name = "N")]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
     pub(crate) nodes_per_page: Option<u32>,
     /// Points in a page [default: 1024]
-    #[arg(long, value_name = "N")]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
     pub(crate) points_per_page: Option<u32>,
 }
 
@@ -170,7 +170,7 @@ impl OctreeArgs {
 #[command(next_help_heading = "Camera")]
 pub(crate) struct CameraArgs {
     /// Which of the file's cameras, from 0; a file without cameras is seen from its front [default: 0]
-    #[arg(long, value_name = "N")]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
     pub(crate) camera: Option<usize>,
     /// Pixels of the picture [default: 540 rows, columns as the camera asks, else 960]
     #[arg(long, value_name = "WxH", value_parser = picture_size)]
