@@ -1,1 +1,18 @@
-//! Placeholder.
+//! Typed client of the shading server: [`Client`] submits build and shade jobs over the daemon's socket, watches them and asks
+//! about scenes; [`private`] finds or starts the daemon that a user without one gets.
+//!
+//! gRPC stays inside: requests and answers are plain types, every request has a deadline, every error says what was wanted.
+//! The `pbgi-client` command line is built on this crate.
+#![forbid(unsafe_code)]
+
+mod client;
+mod convert;
+mod error;
+mod job;
+pub mod private;
+pub mod size;
+
+pub use client::Client;
+pub use error::{ClientError, Refusal};
+pub use job::{BuildJob, DaemonStatus, Job, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
+pub use pbgi_points::Density;

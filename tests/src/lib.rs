@@ -1,1 +1,29 @@
-//! Placeholder.
+//! Harness for tests that need more than one process: a private daemon in a fresh directory, driven through the command
+//! line as a user would, and the picture files it leaves.
+//!
+//! Start at [`House`]. Nothing here reaches into the daemon: what a test sees is what a user sees.
+#![forbid(unsafe_code)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "a harness fails by panicking"
+)]
+
+mod house;
+mod picture;
+
+pub use house::{House, Run, program, workspace_root};
+pub use picture::{Picture, relative_rms, rms};
+
+use std::path::PathBuf;
+
+/// A file of the shared real-world data, or `None` with a loud word that the test was skipped.
+pub fn shared(path: &str) -> Option<PathBuf> {
+    let file = workspace_root().join("../shared").join(path);
+    if file.metadata().is_ok() {
+        return Some(file.canonicalize().unwrap());
+    }
+    eprintln!("SKIPPED: {path} is not there (looked for {})", file.display());
+    None
+}

@@ -4,6 +4,7 @@ use crate::morton::Quantizer;
 use crate::node::NodeAttributes;
 use crate::pack::pack_harmonics;
 use crate::point::PointRecord;
+use crate::section::{section_area, voxel_half_spaces};
 use crate::sh::{SH_TERMS, project_cosine};
 use crate::voxel::Voxel;
 use glam::{DMat3, DVec3, Vec3};
@@ -124,8 +125,8 @@ impl ClusterAccumulator {
         let axis = self.axis();
         let aligned = quadratic_form(&self.normal_moment, axis) / self.area;
         let origin = DVec3::from_array(quantizer.origin);
-        let corner = DVec3::from_array(voxel.min_corner(quantizer)) - origin;
-        let section = plane_section_area((mean - corner) / edge, axis) * edge * edge;
+        let center = DVec3::from_array(voxel.min_corner(quantizer)) - origin + edge / 2.0;
+        let section = section_area(mean, axis, 2.0 * edge, &voxel_half_spaces(center, edge / 2.0, axis));
         let (sh, clamped) = pack_harmonics(&self.sh, edge);
         let attributes = NodeAttributes {
             centroid: (mean + origin).as_vec3(),
@@ -171,52 +172,6 @@ fn outer(v: DVec3) -> [f64; 6] {
 fn quadratic_form(m: &[f64; 6], v: DVec3) -> f64 {
     let o = outer(v);
     m[0] * o[0] + m[1] * o[1] + m[2] * o[2] + 2.0 * (m[3] * o[3] + m[4] * o[4] + m[5] * o[5])
-}
-
-/// Area in which the plane through `through` with unit `normal` cuts the unit cube.
-fn plane_section_area(through: DVec3, normal: DVec3) -> f64 {
-    /// Longer than any chord of the unit cube around a point in it.
-    const REACH: f64 = 2.0;
-    /// A square cut by six half-spaces.
-    const CORNERS_MAX: usize = 10;
-    let (u, v) = normal.any_orthonormal_pair();
-    let mut polygon = [DVec3::ZERO; CORNERS_MAX];
-    polygon[..4].copy_from_slice(&[
-        through - u * REACH - v * REACH,
-        through + u * REACH - v * REACH,
-        through + u * REACH + v * REACH,
-        through - u * REACH + v * REACH,
-    ]);
-    let mut corners = 4;
-    for axis in 0..3 {
-        for (sign, offset) in [(1.0, 0.0), (-1.0, 1.0)] {
-            let inside = |p: DVec3| sign * p[axis] + offset;
-            let mut clipped = [DVec3::ZERO; CORNERS_MAX];
-            let mut kept = 0;
-            for i in 0..corners {
-                let (a, b) = (polygon[i], polygon[(i + 1) % corners]);
-                let (da, db) = (inside(a), inside(b));
-                if da >= 0.0 && kept < CORNERS_MAX {
-                    clipped[kept] = a;
-                    kept += 1;
-                }
-                if (da >= 0.0) != (db >= 0.0) && kept < CORNERS_MAX {
-                    clipped[kept] = a + (b - a) * (da / (da - db));
-                    kept += 1;
-                }
-            }
-            (polygon, corners) = (clipped, kept);
-        }
-    }
-    let doubled: DVec3 = (1..corners.max(1))
-        .map(|i| polygon[i - 1].cross(polygon[i]))
-        .sum::<DVec3>()
-        + if corners > 0 {
-            polygon[corners - 1].cross(polygon[0])
-        } else {
-            DVec3::ZERO
-        };
-    doubled.dot(normal).abs() / 2.0
 }
 
 /// Front-side radiance of a flat cluster and of its back, from harmonics evaluated at the axis and opposite to it.
@@ -333,15 +288,5 @@ mod tests {
             .collect();
         let node = summed(&points).finalize(Voxel::ROOT, &quantizer()).attributes;
         assert!((node.spread - (2.0f32 / 3.0).sqrt()).abs() < 0.02, "{}", node.spread);
-    }
-
-    #[test]
-    fn plane_sections_have_their_known_areas() {
-        let center = DVec3::splat(0.5);
-        let diagonal = DVec3::ONE.normalize();
-        assert!((plane_section_area(center, DVec3::Z) - 1.0).abs() < 1e-12);
-        assert!((plane_section_area(center, DVec3::new(1.0, 1.0, 0.0).normalize()) - 2f64.sqrt()).abs() < 1e-12);
-        // The regular hexagon with edges of half a face diagonal.
-        assert!((plane_section_area(center, diagonal) - 1.299_038).abs() < 1e-6);
     }
 }

@@ -15,6 +15,7 @@ pub mod octahedral;
 pub mod pack;
 pub mod point;
 pub mod scene;
+pub mod section;
 pub mod settings;
 pub mod sh;
 pub mod statistics;

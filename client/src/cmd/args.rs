@@ -1,0 +1,260 @@
+//! Options that several commands share, and how their values are read.
+
+use super::failure::Failure;
+use super::files::{self, Existing};
+use clap::Args;
+use pbgi_client::private::PrivateOptions;
+use pbgi_client::size::parse_bytes;
+use pbgi_core::{BuildSettings, ShadeSettings, limits};
+use pbgi_points::Density;
+use std::path::PathBuf;
+
+/// Which daemon.
+#[derive(Args, Debug, Default)]
+#[command(next_help_heading = "Daemon")]
+pub(crate) struct ServerArgs {
+    /// Use the daemon at this address, unix:/path/to/jobs.sock, instead of a private one
+    #[arg(long, value_name = "URI")]
+    pub(crate) server: Option<String>,
+    /// Memory of the private daemon, all of its processes together: 2G, 512M
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, conflicts_with = "server")]
+    pub(crate) memory: Option<u64>,
+    /// Worker processes of the private daemon; with --server, most workers for this job
+    #[arg(long, allow_negative_numbers = true, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=limits::WORKERS_MAX as i64))]
+    pub(crate) workers: Option<u32>,
+}
+
+impl ServerArgs {
+    pub(crate) fn private_options(&self) -> PrivateOptions {
+        PrivateOptions {
+            memory_bytes: self.memory,
+            workers: self.workers,
+        }
+    }
+
+    /// A private daemon has as many workers as were asked for; a shared one is asked to use no more for this job.
+    pub(crate) fn job_workers(&self) -> Option<u32> {
+        self.workers.filter(|_| self.server.is_some())
+    }
+}
+
+/// Which of the running daemons, for commands that start none.
+#[derive(Args, Debug, Default)]
+pub(crate) struct RunningArgs {
+    /// The daemon's address, unix:/path/to/jobs.sock; without it, your private daemons
+    #[arg(long, value_name = "URI")]
+    pub(crate) server: Option<String>,
+}
+
+/// Where results go.
+#[derive(Args, Debug)]
+pub(crate) struct OutputArgs {
+    /// The file to write
+    #[arg(short, long, value_name = "OUT")]
+    pub(crate) output: PathBuf,
+    /// Replace an existing output
+    #[arg(long)]
+    pub(crate) overwrite: bool,
+}
+
+/// The statistics file.
+#[derive(Args, Debug, Default)]
+pub(crate) struct StatsArgs {
+    /// Write the statistics to this file as one JSON object
+    #[arg(long, value_name = "FILE.json")]
+    pub(crate) stats: Option<PathBuf>,
+}
+
+impl StatsArgs {
+    /// Finds out before any work is done that the file cannot be written.
+    pub(crate) fn check(&self) -> Result<(), Failure> {
+        match &self.stats {
+            Some(path) => files::output(path, Existing::Replace).map(drop),
+            None => Ok(()),
+        }
+    }
+}
+
+/// How densely meshes are sampled.
+#[derive(Args, Clone, Copy, Debug, Default)]
+#[command(next_help_heading = "Sampling of meshes")]
+pub(crate) struct DensityArgs {
+    /// Number of points on all surfaces together
+    #[arg(long, allow_negative_numbers = true, value_name = "N", value_parser = clap::value_parser!(u64).range(1..), conflicts_with = "spacing")]
+    pub(crate) points: Option<u64>,
+    /// Distance between neighbouring points, world units
+    #[arg(long, allow_negative_numbers = true, value_name = "D", value_parser = positive)]
+    pub(crate) spacing: Option<f32>,
+}
+
+impl DensityArgs {
+    pub(crate) fn density(&self) -> Option<Density> {
+        let points = self.points.map(Density::Points);
+        points.or(self.spacing.map(Density::Spacing))
+    }
+}
+
+/// How receivers are shaded.
+#[derive(Args, Debug, Default)]
+#[command(next_help_heading = "Shading")]
+pub(crate) struct QualityArgs {
+    /// Largest solid angle of a cut element, steradian: smaller is finer and slower [default: 0.05]
+    #[arg(long, allow_negative_numbers = true, value_name = "SR")]
+    pub(crate) max_solid_angle: Option<f32>,
+    /// Rows and columns of the raster: 8, 16, 32 or 64 [default: 64]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
+    pub(crate) raster_resolution: Option<u32>,
+    /// Distance beyond which surfaces do not occlude, world units; acts on occlusion and bent normal [default: unlimited]
+    #[arg(long, allow_negative_numbers = true, value_name = "D")]
+    pub(crate) max_dist: Option<f32>,
+    /// How fast occlusion fades with distance d: exp(-falloff d) [default: 0]
+    #[arg(long, allow_negative_numbers = true, value_name = "F")]
+    pub(crate) falloff: Option<f32>,
+    /// Surfaces within this fraction of a point's radius are the receiver's own [default: 0.1]
+    #[arg(long, allow_negative_numbers = true, value_name = "B")]
+    pub(crate) bias: Option<f32>,
+    /// Light probe around the scene: a latitude-longitude .hdr or .exr, y up [default: black]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) environment: Option<PathBuf>,
+}
+
+impl QualityArgs {
+    pub(crate) fn settings(&self) -> Result<ShadeSettings, Failure> {
+        let default = ShadeSettings::default();
+        let settings = ShadeSettings {
+            max_solid_angle: self.max_solid_angle.unwrap_or(default.max_solid_angle),
+            raster_resolution: self.raster_resolution.unwrap_or(default.raster_resolution),
+            max_dist: self.max_dist.unwrap_or(default.max_dist),
+            falloff: self.falloff.unwrap_or(default.falloff),
+            bias: self.bias.unwrap_or(default.bias),
+        };
+        settings.validate()?;
+        Ok(settings)
+    }
+}
+
+/// How octrees are built.
+#[derive(Args, Debug, Default)]
+#[command(next_help_heading = "Octree")]
+pub(crate) struct OctreeArgs {
+    /// Most points in a leaf [default: 16]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
+    pub(crate) leaf_max: Option<u32>,
+    /// Levels written together; 0 writes siblings as soon as their parent is known [default: 3]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
+    pub(crate) chunk_levels: Option<u32>,
+    /// Nodes in a page [default: 256]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
+    pub(crate) nodes_per_page: Option<u32>,
+    /// Points in a page [default: 1024]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
+    pub(crate) points_per_page: Option<u32>,
+}
+
+impl OctreeArgs {
+    pub(crate) fn settings(&self) -> Result<BuildSettings, Failure> {
+        let default = BuildSettings::default();
+        let settings = BuildSettings {
+            leaf_max: self.leaf_max.unwrap_or(default.leaf_max),
+            chunk_levels: self.chunk_levels.unwrap_or(default.chunk_levels),
+            nodes_per_page: self.nodes_per_page.unwrap_or(default.nodes_per_page),
+            points_per_page: self.points_per_page.unwrap_or(default.points_per_page),
+        };
+        settings.validate()?;
+        Ok(settings)
+    }
+}
+
+/// What the camera is.
+#[derive(Args, Clone, Copy, Debug, Default)]
+#[command(next_help_heading = "Camera")]
+pub(crate) struct CameraArgs {
+    /// Which of the file's cameras, from 0; a file without cameras is seen from its front [default: 0]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
+    pub(crate) camera: Option<usize>,
+    /// Pixels of the picture [default: 540 rows, columns as the camera asks, else 960]
+    #[arg(long, value_name = "WxH", value_parser = picture_size)]
+    pub(crate) size: Option<Size>,
+}
+
+/// Pixels of a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Size {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+}
+
+pub(crate) fn picture_size(text: &str) -> Result<Size, String> {
+    let fault = || format!("{text:?} is no size in pixels: write width x height, such as 1920x1080");
+    let (width, height) = text.split_once(['x', 'X']).ok_or_else(fault)?;
+    let number = |text: &str| text.parse::<u32>().ok().filter(|&pixels| pixels > 0).ok_or_else(fault);
+    let size = Size {
+        width: number(width)?,
+        height: number(height)?,
+    };
+    let pixels = u64::from(size.width) * u64::from(size.height);
+    if pixels > limits::IMAGE_PIXELS_MAX {
+        return Err(format!(
+            "{text} has {pixels} pixels, at most {} are possible",
+            limits::IMAGE_PIXELS_MAX
+        ));
+    }
+    Ok(size)
+}
+
+fn positive(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(value) if value > 0.0 && value.is_finite() => Ok(value),
+        _ => Err("it must be a number above 0".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn picture_sizes_are_read() {
+        let size = picture_size("1920x1080").unwrap();
+        assert_eq!((size.width, size.height), (1920, 1080));
+        for text in [
+            "",
+            "1920",
+            "0x5",
+            "5x0",
+            "-1x2",
+            "axb",
+            "4294967295x4294967295",
+            "1x2x3",
+        ] {
+            assert!(picture_size(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn unset_options_take_the_defaults() {
+        assert_eq!(QualityArgs::default().settings().unwrap(), ShadeSettings::default());
+        assert_eq!(OctreeArgs::default().settings().unwrap(), BuildSettings::default());
+    }
+
+    #[test]
+    fn a_setting_out_of_range_is_a_usage_error_that_names_the_option() {
+        let args = QualityArgs {
+            raster_resolution: Some(7),
+            ..Default::default()
+        };
+        let failure = args.settings().unwrap_err();
+        assert_eq!(failure.to_string(), "--raster-resolution is 7, must be 8, 16, 32 or 64");
+        assert!(matches!(failure, Failure::Usage(_)));
+    }
+
+    #[test]
+    fn help_states_the_real_defaults() {
+        let shade = ShadeSettings::default();
+        let build = BuildSettings::default();
+        let (sr, raster, bias) = (shade.max_solid_angle, shade.raster_resolution, shade.bias);
+        assert_eq!((sr, raster, bias, shade.falloff), (0.05, 64, 0.1, 0.0));
+        assert_eq!((build.leaf_max, build.chunk_levels), (16, 3));
+        assert_eq!((build.nodes_per_page, build.points_per_page), (256, 1024));
+    }
+}

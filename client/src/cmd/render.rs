@@ -1,0 +1,254 @@
+//! `render` and `demo`: from a mesh to a picture in one command.
+
+use super::args::{CameraArgs, DensityArgs, OutputArgs, QualityArgs, ServerArgs, Size, StatsArgs};
+use super::composite::composite;
+use super::failure::Failure;
+use super::files::{self, Existing};
+use super::frame;
+use super::interrupt::Interrupt;
+use super::progress::Progress;
+use super::scenes::{self, SceneCache};
+use super::session::{self, Work};
+use super::summary;
+use clap::Args;
+use pbgi_client::{BuildJob, Client, ShadeJob};
+use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
+use pbgi_points::{Density, GBuffer, LayeredImage, SampleOptions, ToneMap, demo, write_png};
+use std::path::{Path, PathBuf};
+
+const RENDER_EXAMPLES: &str = "\
+Examples:
+  pbgi-client render hall.glb -o hall.exr
+  pbgi-client render hall.glb -o hall.exr --png hall.png --size 1920x1080 --environment sky.hdr --memory 1G
+
+The root R, G, B is the beauty: albedo / pi (direct + indirect) + emission; the parts, occlusion and bentnormal are layers.
+The built scene stays in XDG_CACHE_HOME/pbgi/scenes, keyed by the mesh and its sampling: the next render of it is warm.";
+
+/// `render`
+#[derive(Args, Debug)]
+#[command(after_help = RENDER_EXAMPLES)]
+pub(crate) struct RenderArgs {
+    /// A mesh with lights: .glb, .gltf, .obj
+    #[arg(value_name = "SCENE")]
+    scene: PathBuf,
+    #[command(flatten)]
+    output: OutputArgs,
+    /// Also write a tone-mapped picture to look at
+    #[arg(long, value_name = "FILE.png")]
+    png: Option<PathBuf>,
+    #[command(flatten)]
+    camera: CameraArgs,
+    #[command(flatten)]
+    density: DensityArgs,
+    #[command(flatten)]
+    quality: QualityArgs,
+    #[command(flatten)]
+    stats: StatsArgs,
+    #[command(flatten)]
+    server: ServerArgs,
+}
+
+/// `demo`
+#[derive(Args, Debug)]
+pub(crate) struct DemoArgs {
+    /// The picture; the tone-mapped one lies beside it [default: demo.exr, replaced if it is there]
+    #[arg(short, long, value_name = "OUT.exr")]
+    output: Option<PathBuf>,
+    /// Replace an existing output
+    #[arg(long)]
+    overwrite: bool,
+    /// Pixels of the picture [default: 480x360]
+    #[arg(long, value_name = "WxH", value_parser = super::args::picture_size)]
+    size: Option<Size>,
+    #[command(flatten)]
+    density: DensityArgs,
+    #[command(flatten)]
+    quality: QualityArgs,
+    #[command(flatten)]
+    stats: StatsArgs,
+    #[command(flatten)]
+    server: ServerArgs,
+}
+
+const DEMO_OUTPUT: &str = "demo.exr";
+const DEMO_SIZE: Size = Size {
+    width: 480,
+    height: 360,
+};
+/// Enough for a smooth picture of a small room.
+const DEMO_POINTS: u64 = 200_000;
+
+/// Everything about a picture that was checked before work began.
+struct Plan {
+    input: PathBuf,
+    output: PathBuf,
+    png: Option<PathBuf>,
+    camera: CameraArgs,
+    density: Density,
+    settings: ShadeSettings,
+    environment: Option<PathBuf>,
+}
+
+pub(crate) async fn render(args: RenderArgs, interrupt: &Interrupt) -> Result<(), Failure> {
+    let existing = Existing::from_flag(args.output.overwrite);
+    let png = args.png.as_deref();
+    args.stats.check()?;
+    let plan = Plan {
+        settings: args.quality.settings()?,
+        input: files::input(&args.scene)?,
+        output: files::output_of_kind(&args.output.output, existing, "exr")?,
+        png: png
+            .map(|path| files::output_of_kind(path, existing, "png"))
+            .transpose()?,
+        camera: args.camera,
+        density: args.density.density().unwrap_or(SampleOptions::default().density),
+        environment: args.quality.environment.as_deref().map(files::input).transpose()?,
+    };
+    picture(&plan, &args.server, &args.stats, interrupt).await
+}
+
+pub(crate) async fn demo(args: DemoArgs, interrupt: &Interrupt) -> Result<(), Failure> {
+    // The demo may be shown twice; a name that the user chose is the user's.
+    let existing = Existing::from_flag(args.overwrite || args.output.is_none());
+    let output = args.output.as_deref().unwrap_or(Path::new(DEMO_OUTPUT));
+    args.stats.check()?;
+    let folder = temporary_folder()?;
+    let mut plan = Plan {
+        settings: args.quality.settings()?,
+        input: folder.path().join("demo.glb"),
+        output: files::output_of_kind(output, existing, "exr")?,
+        png: Some(files::output(&output.with_extension("png"), existing)?),
+        camera: CameraArgs {
+            camera: None,
+            size: Some(args.size.unwrap_or(DEMO_SIZE)),
+        },
+        density: args.density.density().unwrap_or(Density::Points(DEMO_POINTS)),
+        environment: args.quality.environment.as_deref().map(files::input).transpose()?,
+    };
+    demo::write_glb(&plan.input)?;
+    plan.input = files::input(&plan.input)?;
+    picture(&plan, &args.server, &args.stats, interrupt).await
+}
+
+async fn picture(plan: &Plan, server: &ServerArgs, stats: &StatsArgs, interrupt: &Interrupt) -> Result<(), Failure> {
+    let folder = temporary_folder()?;
+    let (statistics, gbuffer, shaded) = {
+        let mut progress = Progress::new();
+        progress.stage("rendering the G-buffer");
+        let (input, camera) = (plan.input.clone(), plan.camera);
+        let gbuffer = interrupt.blocking(move || frame::render(&input, camera)).await?;
+        let passes = folder.path().join("gbuffer.exr");
+        gbuffer.write(&passes)?;
+        let client = session::connect(server, interrupt, &progress).await?;
+        let (scene, mut statistics) = scene(plan, &client, interrupt, &mut progress).await?;
+        let shaded = folder.path().join("shaded.exr");
+        let job = ShadeJob {
+            scene,
+            gbuffer: passes,
+            output: shaded.clone(),
+            overwrite: false,
+            settings: plan.settings,
+            environment: plan.environment.clone(),
+            workers: server.job_workers(),
+        };
+        let shading = session::run(&client, &Work::Shade(job), interrupt, &mut progress).await?;
+        add(&mut statistics, &shading);
+        (statistics, gbuffer, shaded)
+    };
+    write(plan, &gbuffer, &shaded, &statistics)?;
+    summary::report(&statistics, stats.stats.as_deref())
+}
+
+/// The scene of the mesh: the one that an earlier render left, or a new one.
+async fn scene(
+    plan: &Plan,
+    client: &Client,
+    interrupt: &Interrupt,
+    progress: &mut Progress,
+) -> Result<(PathBuf, Statistics), Failure> {
+    let cache = SceneCache::open(&session::folders()?.cache)?;
+    let (input, density) = (plan.input.clone(), plan.density);
+    let digest = interrupt.blocking(move || scenes::digest(&input, density)).await?;
+    let kept = interrupt.guard(cache.keep(&digest)).await?;
+    let mut statistics = Statistics::default();
+    if client.scene(&kept.scene).await.is_ok() {
+        progress.say("using the scene that an earlier render built");
+    } else {
+        let job = BuildJob {
+            inputs: vec![plan.input.clone()],
+            output: kept.scene.clone(),
+            // What lies there and cannot be opened is of no use.
+            overwrite: true,
+            settings: BuildSettings::default(),
+            density: Some(plan.density),
+        };
+        match plan.density {
+            Density::Points(points) => progress.say(&format!("sampling about {} points", summary::grouped(points))),
+            Density::Spacing(spacing) => progress.say(&format!("sampling points {spacing} apart")),
+        }
+        statistics = session::run(client, &Work::Build(job), interrupt, progress).await?;
+    }
+    kept.mark(&plan.input);
+    cache.trim();
+    Ok((kept.scene.clone(), statistics))
+}
+
+/// One command, one record: bytes of both jobs, the higher peak, everything else from whichever job knows it.
+fn add(statistics: &mut Statistics, shading: &Statistics) {
+    let build = statistics.clone();
+    statistics.update(shading);
+    let sum = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(|a, b| a + b);
+    let most = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::max);
+    statistics.bytes_read = sum(build.bytes_read, shading.bytes_read);
+    statistics.bytes_written = sum(build.bytes_written, shading.bytes_written);
+    statistics.peak_memory_bytes = most(build.peak_memory_bytes, shading.peak_memory_bytes);
+}
+
+fn write(plan: &Plan, gbuffer: &GBuffer, shaded: &Path, statistics: &Statistics) -> Result<(), Failure> {
+    let image = composite(gbuffer, LayeredImage::read_exr(shaded)?, statistics)?;
+    image.write_exr(&plan.output)?;
+    eprintln!("wrote {}", plan.output.display());
+    if let Some(path) = &plan.png {
+        let beauty = image.triple("").unwrap_or_default();
+        let window = image.data_window;
+        write_png(path, window.width, window.height, &beauty, ToneMap::Filmic)?;
+        eprintln!("wrote {}", path.display());
+    }
+    Ok(())
+}
+
+fn temporary_folder() -> Result<tempfile::TempDir, Failure> {
+    let folder = tempfile::Builder::new().prefix("pbgi-render-").tempdir();
+    folder.map_err(|error| {
+        Failure::failed(format!(
+            "cannot make a temporary folder: {error}; set TMPDIR to one that has room"
+        ))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_record_of_a_render_covers_both_jobs() {
+        let mut statistics = Statistics {
+            build_seconds: Some(2.0),
+            bytes_read: Some(10.0),
+            peak_memory_bytes: Some(7.0),
+            ..Default::default()
+        };
+        let shading = Statistics {
+            shading_seconds: Some(3.0),
+            bytes_read: Some(5.0),
+            peak_memory_bytes: Some(6.0),
+            ..Default::default()
+        };
+        add(&mut statistics, &shading);
+        assert_eq!(statistics.build_seconds, Some(2.0));
+        assert_eq!(statistics.shading_seconds, Some(3.0));
+        assert_eq!(statistics.bytes_read, Some(15.0));
+        assert_eq!(statistics.peak_memory_bytes, Some(7.0));
+        assert_eq!(statistics.bytes_written, None);
+    }
+}

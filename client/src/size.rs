@@ -1,0 +1,99 @@
+//! Sizes as people write and read them: `2G`, `512M`; "1.5 GiB".
+
+const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
+
+/// Reads a size in bytes: a number with an optional K, M, G or T (powers of 1024), itself with an optional `B` or `iB`.
+///
+/// # Errors
+/// What is wrong, with an example of what would be right.
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
+    let fault = || format!("{text:?} is no size: write a number with K, M, G or T, such as 2G or 512M");
+    let upper = text.trim().to_ascii_uppercase();
+    let bare = upper.strip_suffix("IB").or(upper.strip_suffix('B')).unwrap_or(&upper);
+    let unit = UNITS.iter().find(|(letter, _)| bare.ends_with(*letter));
+    let (number, shift) = match unit {
+        Some((_, shift)) => (&bare[..bare.len() - 1], *shift),
+        None => (bare, 0),
+    };
+    let plain = !number.is_empty() && number.chars().all(|c| c.is_ascii_digit() || c == '.');
+    let value: f64 = if plain {
+        number.parse().map_err(|_| fault())?
+    } else {
+        return Err(fault());
+    };
+    let bytes = value * (1u64 << shift) as f64;
+    if bytes < 1.0 {
+        return Err(format!("{text:?} is no size: it must be above 0"));
+    }
+    if bytes >= (1u64 << 53) as f64 {
+        return Err(format!("{text:?} is more than any machine has"));
+    }
+    Ok(bytes as u64)
+}
+
+/// A size for people: the number, and its unit.
+pub fn scaled_bytes(bytes: f64) -> (f64, &'static str) {
+    const NAMES: [&str; 5] = ["B", "KiB", "MiB", "GiB", "TiB"];
+    let mut value = bytes;
+    let mut name = 0;
+    while value >= 1024.0 && name + 1 < NAMES.len() {
+        value /= 1024.0;
+        name += 1;
+    }
+    (value, NAMES[name])
+}
+
+/// A size for people, as text.
+pub fn format_bytes(bytes: u64) -> String {
+    match scaled_bytes(bytes as f64) {
+        (value, "B") => format!("{value} B"),
+        (value, unit) => format!("{value:.1} {unit}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_read() {
+        for (text, bytes) in [
+            ("2G", 2 << 30),
+            ("512M", 512 << 20),
+            ("1.5g", 3 << 29),
+            ("64KiB", 64 << 10),
+            ("10mb", 10 << 20),
+            ("1T", 1 << 40),
+            ("4096", 4096),
+            ("4096B", 4096),
+        ] {
+            assert_eq!(parse_bytes(text), Ok(bytes), "{text}");
+        }
+    }
+
+    #[test]
+    fn nonsense_is_no_size() {
+        for text in [
+            "",
+            "G",
+            "two",
+            "-1G",
+            "1..5G",
+            "1e3",
+            "NaN",
+            "inf",
+            "0",
+            "0.0001",
+            "99999999T",
+            "2 G G",
+        ] {
+            assert!(parse_bytes(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn sizes_are_written_for_people() {
+        assert_eq!(format_bytes(100), "100 B");
+        assert_eq!(format_bytes(3 << 29), "1.5 GiB");
+    }
+}

@@ -1,0 +1,201 @@
+//! Footprints: the convex cones, seen from the receiver, in which a disc or a cluster hides what is behind it.
+//!
+//! A footprint is a piece of a plane cut by slabs. The ray `d` meets the plane `n.x = k` at `k d / (n.d)`, so the slab
+//! `low <= a.x <= high` is the pair of half-spaces `(k a - low n).d >= 0` and `(high n - k a).d >= 0`: linear in `d`.
+
+use crate::frame::Frame;
+use crate::raster::LANES;
+use glam::Vec3;
+
+/// Half-spaces of the widest footprint: a section cut by two facets, or the octagon of a disc.
+const HALF_SPACES_MAX: usize = 8;
+/// Apothem of an octagon over the radius of the disc of equal area.
+const OCTAGON_APOTHEM: f32 = 0.973_68;
+/// Cosine between a plane's normal and an axis from which the plane counts as running along the faces across that axis.
+const ALONG_FACE: f32 = 0.9;
+/// How far such a plane may lie outside the voxel, as a share of its half edge.
+const FACE_SLACK: f32 = 0.05;
+
+/// The half-space `x d.x + y d.y + z d.z >= 0` in the receiver's frame.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct HalfSpace {
+    pub(crate) inverse_x: f32,
+    pub(crate) y: f32,
+    pub(crate) z: f32,
+}
+
+/// A convex cone with its apex at the receiver, in the receiver's frame.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Footprint {
+    half_spaces: [HalfSpace; HALF_SPACES_MAX],
+    len: usize,
+    /// Sphere around the piece of plane.
+    center: Vec3,
+    radius: f32,
+}
+
+/// The plane of a footprint, on the far side of the receiver: `normal.x = distance`, `distance > 0`; world directions,
+/// positions relative to the receiver.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Plane {
+    pub(crate) normal: Vec3,
+    pub(crate) distance: f32,
+}
+
+impl Plane {
+    /// Through `point` (relative to the receiver) with `normal`, turned away from the receiver. A receiver within `touch`
+    /// of the plane is taken to stand that far in front of it: at the foot of a wall the wall hides half of the sky.
+    #[inline(always)]
+    pub(crate) fn through(point: Vec3, normal: Vec3, touch: f32) -> Self {
+        let distance = normal.dot(point);
+        if distance < touch {
+            Self {
+                normal: -normal,
+                distance: (-distance).max(touch),
+            }
+        } else {
+            Self { normal, distance }
+        }
+    }
+}
+
+impl Footprint {
+    #[inline(always)]
+    fn empty(center: Vec3, radius: f32) -> Self {
+        Self {
+            half_spaces: [HalfSpace::default(); HALF_SPACES_MAX],
+            len: 0,
+            center,
+            radius,
+        }
+    }
+
+    #[inline(always)]
+    pub(crate) fn half_spaces(&self) -> &[HalfSpace] {
+        &self.half_spaces[..self.len]
+    }
+
+    #[inline(always)]
+    fn add_half_space(&mut self, g: Vec3) {
+        /// Keeps the division defined; a row is then inside or outside as a whole.
+        const TINY: f32 = 1e-20;
+        let x = if g.x.abs() < TINY { TINY } else { g.x };
+        self.half_spaces[self.len] = HalfSpace {
+            inverse_x: 1.0 / x,
+            y: g.y,
+            z: g.z,
+        };
+        self.len += 1;
+    }
+
+    /// All vectors in the receiver's frame.
+    #[inline(always)]
+    fn add_slab(&mut self, normal: Vec3, distance: f32, axis: Vec3, low: f32, high: f32) {
+        self.add_half_space(axis * distance - normal * low);
+        self.add_half_space(normal * high - axis * distance);
+    }
+
+    /// A rectangle around `center` in the plane with `normal` at `distance`, given by unit axes and half extents; everything
+    /// in the receiver's frame.
+    #[inline(always)]
+    pub(crate) fn rectangle(center: Vec3, normal: Vec3, distance: f32, sides: [(Vec3, f32); 2]) -> Self {
+        let mut footprint = Self::empty(center, (sides[0].1 * sides[0].1 + sides[1].1 * sides[1].1).sqrt());
+        for (axis, half) in sides {
+            let middle = axis.dot(center);
+            footprint.add_slab(normal, distance, axis, middle - half, middle + half);
+        }
+        footprint
+    }
+
+    /// The octagon with the area of a disc; `center` relative to the receiver, world directions.
+    #[inline(always)]
+    pub(crate) fn disc(frame: &Frame, center: Vec3, plane: Plane, radius: f32) -> Self {
+        let (u, v) = plane.normal.any_orthonormal_pair();
+        let (u, v) = (frame.local_from_world(u), frame.local_from_world(v));
+        let normal = frame.local_from_world(plane.normal);
+        let center = frame.local_from_world(center);
+        let half = radius * OCTAGON_APOTHEM;
+        let mut footprint = Self::empty(center, radius * 1.06);
+        let (p, q) = (
+            (u + v) * std::f32::consts::FRAC_1_SQRT_2,
+            (u - v) * std::f32::consts::FRAC_1_SQRT_2,
+        );
+        for axis in [u, v, p, q] {
+            let middle = axis.dot(center);
+            footprint.add_slab(normal, plane.distance, axis, middle - half, middle + half);
+        }
+        footprint
+    }
+
+    /// Where a plane cuts a voxel; `center` of the voxel relative to the receiver, `half` its half edge.
+    #[inline(always)]
+    pub(crate) fn voxel_section(frame: &Frame, center: Vec3, half: f32, plane: Plane) -> Self {
+        let normal = frame.local_from_world(plane.normal);
+        let mut footprint = Self::empty(frame.local_from_world(center), half * 1.732_051);
+        for (axis, middle) in [(Vec3::X, center.x), (Vec3::Y, center.y), (Vec3::Z, center.z)] {
+            // A plane along a face of the voxel must not fall out of it by rounding.
+            let half = if axis.dot(plane.normal).abs() > ALONG_FACE {
+                half * (1.0 + FACE_SLACK)
+            } else {
+                half
+            };
+            let axis = frame.local_from_world(axis);
+            footprint.add_slab(normal, plane.distance, axis, middle - half, middle + half);
+        }
+        footprint
+    }
+
+    /// Keeps the part of a section with `cut.x >= distance`; world directions, relative to the receiver.
+    #[inline(always)]
+    pub(crate) fn cut(&mut self, frame: &Frame, plane: Plane, cut: Vec3, distance: f32) {
+        let (normal, cut) = (frame.local_from_world(plane.normal), frame.local_from_world(cut));
+        self.add_half_space(cut * plane.distance - normal * distance);
+    }
+
+    /// A square that hides a sphere; `center` relative to the receiver, farther than `radius`.
+    #[inline(always)]
+    pub(crate) fn around_sphere(frame: &Frame, center: Vec3, radius: f32) -> Self {
+        let distance = center.length();
+        let direction = frame.local_from_world(center) / distance;
+        let half = radius * distance / (distance * distance - radius * radius).max(1e-30).sqrt();
+        let (u, v) = direction.any_orthonormal_pair();
+        let mut footprint = Self::rectangle(direction * distance, direction, distance, [(u, half), (v, half)]);
+        footprint.radius = half * std::f32::consts::SQRT_2;
+        footprint
+    }
+
+    /// Blocks of rows that the footprint may touch.
+    #[inline(always)]
+    pub(crate) fn rows(&self, resolution: usize) -> std::ops::Range<usize> {
+        let blocks = resolution / LANES;
+        let (y, z) = (self.center.y, self.center.z);
+        let across = (y * y + z * z).sqrt();
+        if across <= self.radius {
+            return 0..blocks;
+        }
+        let (sin, cos) = (y / across, z / across);
+        let delta_sin = self.radius / across;
+        let delta_cos = (1.0 - delta_sin * delta_sin).sqrt();
+        // Row angles phi - delta and phi + delta; those with a negative cosine are below the horizon.
+        let low_above = cos * delta_cos + sin * delta_sin > 0.0;
+        let high_above = cos * delta_cos - sin * delta_sin > 0.0;
+        if !low_above && !high_above && cos <= 0.0 {
+            return 0..0;
+        }
+        let low = if low_above {
+            sin * delta_cos - cos * delta_sin
+        } else {
+            -1.0
+        };
+        let high = if high_above {
+            sin * delta_cos + cos * delta_sin
+        } else {
+            1.0
+        };
+        let block_of = |sin: f32| (sin + 1.0) * 0.5 * blocks as f32;
+        // The rows' middles lie half a row inside; the slack covers rounding.
+        let first = (block_of(low) - 1e-3).max(0.0) as usize;
+        let end = (block_of(high) + 1e-3).ceil().clamp(0.0, blocks as f32) as usize;
+        first..end.max(first)
+    }
+}

@@ -1,0 +1,303 @@
+//! The glue from cache to shade: a node or point by index becomes a slice of a page, wherever that page is.
+//!
+//! Looks in the local cache, then in the shared one, then asks the daemon over the miss channel. Indices come from files and
+//! are checked against the scene's counts, so that a forged scene ends in an error and nowhere else.
+
+use crate::shading::FailureKind;
+use pbgi_cache::channel::{self, PageOutcome, PageReply, PageRequest};
+use pbgi_cache::{CacheError, LoadErrorKind, LocalCache, Origin};
+use pbgi_core::{MountId, NodeIndex, NodeRecord, PageKey, PageKind, PageNo, PointIndex, PointRecord, SceneInfo};
+use pbgi_proto::v1::TileCounters;
+use pbgi_shade::{SceneSource, SourceError};
+use std::os::unix::net::UnixStream;
+use std::time::Instant;
+
+/// The worker's cache and its way to the daemon.
+#[derive(Debug)]
+pub struct Pages {
+    cache: LocalCache,
+    channel: UnixStream,
+    requests: u64,
+}
+
+impl Pages {
+    /// A cache that asks over `channel` for what it lacks.
+    pub fn new(cache: LocalCache, channel: UnixStream) -> Self {
+        Self {
+            cache,
+            channel,
+            requests: 0,
+        }
+    }
+
+    /// Has the daemon load a page, and adopts it.
+    #[cold]
+    fn load(&mut self, key: PageKey, job: u64) -> Result<Origin, Fault> {
+        let span = tracing::debug_span!("page load", kind = %key.kind, page = key.page.0);
+        let _entered = span.enter();
+        // Before asking: the daemon pins the page in this worker's name.
+        self.cache.reserve(key.kind, 1);
+        self.requests += 1;
+        let id = self.requests;
+        let keys = vec![key];
+        channel::send(&self.channel, &PageRequest { id, job, keys })?;
+        let reply: PageReply = channel::receive(&self.channel)?
+            .ok_or_else(|| Fault(FailureKind::Io, "the daemon closed the page channel".to_owned()))?;
+        match (reply.id == id, &reply.outcomes[..]) {
+            (true, [PageOutcome::Pinned(fetched)]) => {
+                self.cache.adopt(key, fetched.frame)?;
+                Ok(fetched.origin)
+            }
+            (true, [PageOutcome::Failed(kind)]) => Err(Fault(failure_kind(*kind), reply.error)),
+            _ => {
+                let text = format!("reply {} with {} pages to request {id}", reply.id, reply.outcomes.len());
+                Err(Fault(FailureKind::Internal, text))
+            }
+        }
+    }
+}
+
+/// What a worker knows of one mounted scene.
+#[derive(Debug)]
+pub struct SceneView {
+    mount: MountId,
+    nodes: FileView,
+    points: FileView,
+    /// Number of the receiver that is being shaded.
+    receiver: u32,
+}
+
+/// One of the scene's files.
+#[derive(Debug)]
+struct FileView {
+    kind: PageKind,
+    records: u64,
+    records_per_page: u32,
+    page_bytes: u64,
+    /// The receiver that touched a page last, by page.
+    stamps: Vec<u32>,
+}
+
+impl SceneView {
+    /// Prepares for a scene.
+    pub fn new(scene: &SceneInfo, mount: MountId) -> Self {
+        let file = |kind, records, records_per_page| FileView {
+            kind,
+            records,
+            records_per_page,
+            page_bytes: scene.page_bytes(kind) as u64,
+            stamps: vec![0; scene.page_count(kind) as usize],
+        };
+        Self {
+            mount,
+            nodes: file(PageKind::Node, scene.node_slots, scene.settings.nodes_per_page),
+            points: file(PageKind::Point, scene.point_count, scene.settings.points_per_page),
+            receiver: 0,
+        }
+    }
+
+    fn begin_receiver(&mut self) {
+        match self.receiver.checked_add(1) {
+            Some(next) => self.receiver = next,
+            None => {
+                self.nodes.stamps.fill(0);
+                self.points.stamps.fill(0);
+                self.receiver = 1;
+            }
+        }
+    }
+}
+
+/// Where the last access to a file went: the next one is likely to go there too.
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    key: PageKey,
+    /// Index of the page's first record.
+    first: u32,
+    /// Records of the file in this page.
+    count: u32,
+}
+
+/// Serves the shading code for one tile.
+#[derive(Debug)]
+pub struct PageSource<'a> {
+    pages: &'a mut Pages,
+    scene: &'a mut SceneView,
+    job: u64,
+    places: [Option<Place>; 2],
+    counters: TileCounters,
+    accesses: u64,
+    fault: Option<Fault>,
+}
+
+impl<'a> PageSource<'a> {
+    /// Serves `scene` out of `pages`, in the name of `job`.
+    pub fn new(pages: &'a mut Pages, scene: &'a mut SceneView, job: u64) -> Self {
+        pages.cache.set_job(job);
+        pages.cache.take_counters();
+        Self {
+            pages,
+            scene,
+            job,
+            places: [None; 2],
+            counters: TileCounters::default(),
+            accesses: 0,
+            fault: None,
+        }
+    }
+
+    /// What happened since this source was made.
+    pub fn counters(&self) -> TileCounters {
+        let found = self.pages.cache.counters();
+        let shared_hits = self.counters.shared_hits + found.shared_hits;
+        let mut counters = self.counters;
+        counters.shared_hits = shared_hits;
+        counters.shared_hits_other_job += found.shared_hits_other_job;
+        counters.local_hits = self.accesses - shared_hits - counters.cache_misses;
+        counters
+    }
+
+    /// Why the last call failed, more exactly than its error says.
+    pub fn take_fault(&mut self) -> Option<(FailureKind, String)> {
+        self.fault.take().map(|Fault(kind, text)| (kind, text))
+    }
+
+    /// The place of a record, its page pinned.
+    #[inline]
+    fn place(&mut self, kind: PageKind, index: u32) -> Result<Place, SourceError> {
+        self.accesses += 1;
+        match self.places[kind as usize] {
+            // Still pinned: it is the page of this kind that was used last.
+            Some(place) if index.wrapping_sub(place.first) < place.count => Ok(place),
+            _ => self.turn_to(kind, index),
+        }
+    }
+
+    fn turn_to(&mut self, kind: PageKind, index: u32) -> Result<Place, SourceError> {
+        let receiver = self.scene.receiver;
+        let mount = self.scene.mount;
+        let file = match kind {
+            PageKind::Node => &mut self.scene.nodes,
+            PageKind::Point => &mut self.scene.points,
+        };
+        let page = index / file.records_per_page;
+        let key = PageKey {
+            mount,
+            kind,
+            page: PageNo(page),
+        };
+        let stamp = file.stamps.get_mut(page as usize);
+        let Some(stamp) = stamp.filter(|_| u64::from(index) < file.records) else {
+            let text = format!("{} {index} of {}", file.kind, file.records);
+            return Err(self.fail(Fault(FailureKind::Corrupt, text)));
+        };
+        if *stamp != receiver {
+            *stamp = receiver;
+            self.counters.traversal_bytes += file.page_bytes;
+        }
+        let first = page * file.records_per_page;
+        let count = (file.records - u64::from(first)).min(u64::from(file.records_per_page)) as u32;
+        if self.pages.cache.get(key).is_none() {
+            self.load(key)?;
+        }
+        let place = Place { key, first, count };
+        self.places[kind as usize] = Some(place);
+        Ok(place)
+    }
+
+    #[cold]
+    fn load(&mut self, key: PageKey) -> Result<(), SourceError> {
+        let start = Instant::now();
+        let loaded = self.pages.load(key, self.job);
+        self.counters.io_nanos += start.elapsed().as_nanos() as u64;
+        let origin = loaded.map_err(|fault| self.fail(fault))?;
+        match origin {
+            Origin::Loaded => self.counters.cache_misses += 1,
+            Origin::Resident => self.counters.shared_hits += 1,
+            Origin::ResidentOtherJob => {
+                self.counters.shared_hits += 1;
+                self.counters.shared_hits_other_job += 1;
+            }
+        }
+        Ok(())
+    }
+
+    /// Remembers a fault in full, and tells the shading code what it can hold.
+    #[cold]
+    fn fail(&mut self, fault: Fault) -> SourceError {
+        let Fault(kind, text) = &fault;
+        let error = match kind {
+            FailureKind::Corrupt => SourceError::Corrupt(text.clone()),
+            _ => SourceError::Io(text.clone()),
+        };
+        self.fault = Some(fault);
+        error
+    }
+
+    /// The bytes of the records `range` (within the page) of a page that `place` pinned.
+    #[inline]
+    fn bytes(&mut self, place: Place, start: usize, end: usize) -> Result<&[u8], SourceError> {
+        let frame = self.pages.cache.get(place.key);
+        let bytes = frame.and_then(|frame| frame.get(start..end));
+        bytes.ok_or_else(|| lost(place))
+    }
+}
+
+impl SceneSource for PageSource<'_> {
+    #[inline]
+    fn node(&mut self, index: NodeIndex) -> Result<&NodeRecord, SourceError> {
+        const BYTES: usize = size_of::<NodeRecord>();
+        let place = self.place(PageKind::Node, index.0)?;
+        let start = (index.0 - place.first) as usize * BYTES;
+        let bytes = self.bytes(place, start, start + BYTES)?;
+        bytemuck::try_from_bytes(bytes).map_err(|_| lost(place))
+    }
+
+    #[inline]
+    fn points(&mut self, first: PointIndex, count: u32) -> Result<&[PointRecord], SourceError> {
+        const BYTES: usize = size_of::<PointRecord>();
+        if count == 0 {
+            return Err(self.fail(Fault(FailureKind::Corrupt, format!("no points from {} on", first.0))));
+        }
+        let place = self.place(PageKind::Point, first.0)?;
+        let slot = first.0 - place.first;
+        let count = count.min(place.count - slot);
+        let start = slot as usize * BYTES;
+        let bytes = self.bytes(place, start, start + count as usize * BYTES)?;
+        bytemuck::try_cast_slice(bytes).map_err(|_| lost(place))
+    }
+
+    fn begin_receiver(&mut self) {
+        self.scene.begin_receiver();
+        // The stamps are looked at when the page changes: have the next access look.
+        self.places = [None; 2];
+    }
+}
+
+/// A frame that is not there or not as large as its layout says: a defect, not an input.
+#[cold]
+fn lost(place: Place) -> SourceError {
+    SourceError::Io(format!("{} page {} left the cache", place.key.kind, place.key.page.0))
+}
+
+/// Kind and text of what went wrong.
+#[derive(Clone, Debug)]
+struct Fault(FailureKind, String);
+
+impl From<CacheError> for Fault {
+    fn from(error: CacheError) -> Self {
+        let kind = match error {
+            CacheError::Channel { .. } => FailureKind::Io,
+            _ => FailureKind::Internal,
+        };
+        Self(kind, error.to_string())
+    }
+}
+
+fn failure_kind(kind: LoadErrorKind) -> FailureKind {
+    match kind {
+        LoadErrorKind::Corrupt => FailureKind::Corrupt,
+        LoadErrorKind::Io => FailureKind::Io,
+        LoadErrorKind::Refused | LoadErrorKind::Internal => FailureKind::Internal,
+    }
+}
