@@ -209,7 +209,7 @@ impl Scheduler {
             // The answer to its last question was lost.
             self.release(held);
         }
-        let takes = |job: &&mut Job| match job.kind {
+        let takes = |job: &Job| match job.kind {
             Kind::Shade { workers_max } => job.leased < workers_max && !job.pending.is_empty(),
             Kind::Build => false,
         };
@@ -217,7 +217,7 @@ impl Scheduler {
             .jobs
             .iter_mut()
             .map(|(&number, job)| (number, job))
-            .find(|(_, job)| takes(&job));
+            .find(|(_, job)| takes(job));
         let Some((number, job)) = found else { return };
         let Some(tile) = job.pending.pop_front() else { return };
         job.leased += 1;

@@ -1,5 +1,6 @@
 //! Whole jobs through a real daemon: its build child is the real one, its workers are this test program in disguise, which
 //! fetches pages as a worker does and answers with values that tell where each receiver was.
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 mod harness;
 

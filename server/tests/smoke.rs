@@ -1,4 +1,5 @@
 //! The program itself: starts, refuses a second daemon, ends without a trace.
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 mod harness;
 

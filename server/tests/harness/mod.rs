@@ -13,26 +13,26 @@ use std::time::{Duration, Instant};
 use tempfile::TempDir;
 use tonic::transport::{Channel, Endpoint};
 
-pub const SERVER: &str = env!("CARGO_BIN_EXE_pbgi-server");
+pub(crate) const SERVER: &str = env!("CARGO_BIN_EXE_pbgi-server");
 
-pub struct Daemon {
-    pub child: Child,
-    pub folder: TempDir,
+pub(crate) struct Daemon {
+    pub(crate) child: Child,
+    pub(crate) folder: TempDir,
 }
 
 /// A worker that sleeps.
-pub fn sleeper(folder: &Path) -> PathBuf {
+pub(crate) fn sleeper(folder: &Path) -> PathBuf {
     script(folder, "sleeper", "exec sleep 1000")
 }
 
-pub fn script(folder: &Path, name: &str, body: &str) -> PathBuf {
+pub(crate) fn script(folder: &Path, name: &str, body: &str) -> PathBuf {
     let path = folder.join(name);
     std::fs::write(&path, format!("#!/bin/sh\n{body}\n")).unwrap();
     std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).unwrap();
     path
 }
 
-pub fn command(folder: &Path, worker: &Path) -> Command {
+pub(crate) fn command(folder: &Path, worker: &Path) -> Command {
     let mut command = Command::new(SERVER);
     command
         .args(["--memory", "256M", "--workers", "2", "--log", "pbgi_server=debug"])
@@ -51,7 +51,7 @@ pub fn command(folder: &Path, worker: &Path) -> Command {
 }
 
 /// The first line on standard output.
-pub fn first_line(child: &mut Child) -> String {
+pub(crate) fn first_line(child: &mut Child) -> String {
     let mut line = String::new();
     BufReader::new(child.stdout.take().unwrap())
         .read_line(&mut line)
@@ -60,7 +60,7 @@ pub fn first_line(child: &mut Child) -> String {
 }
 
 impl Daemon {
-    pub fn start(worker: impl FnOnce(&Path) -> PathBuf, change: impl FnOnce(&mut Command)) -> Self {
+    pub(crate) fn start(worker: impl FnOnce(&Path) -> PathBuf, change: impl FnOnce(&mut Command)) -> Self {
         let folder = tempfile::Builder::new().prefix("pbgi").tempdir().unwrap();
         let mut command = command(folder.path(), &worker(folder.path()));
         let log = std::fs::File::create(folder.path().join("log")).unwrap();
@@ -73,21 +73,21 @@ impl Daemon {
         daemon
     }
 
-    pub fn log(&self) -> String {
+    pub(crate) fn log(&self) -> String {
         std::fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
     }
 
-    pub fn segment(&self) -> PathBuf {
+    pub(crate) fn segment(&self) -> PathBuf {
         let name = std::fs::read_to_string(self.folder.path().join("state/segment")).unwrap();
         Path::new("/dev/shm").join(name.trim().trim_start_matches('/'))
     }
 
-    pub fn signal(&self, signal: &str) {
+    pub(crate) fn signal(&self, signal: &str) {
         let pid = self.child.id().to_string();
         assert!(Command::new("kill").args([signal, &pid]).status().unwrap().success());
     }
 
-    pub fn wait(&mut self) -> ExitStatus {
+    pub(crate) fn wait(&mut self) -> ExitStatus {
         let deadline = Instant::now() + Duration::from_secs(20);
         loop {
             if let Some(status) = self.child.try_wait().unwrap() {
@@ -99,7 +99,7 @@ impl Daemon {
     }
 
     /// Ends the daemon and checks that nothing is left.
-    pub fn stop(mut self) {
+    pub(crate) fn stop(mut self) {
         let segment = self.segment();
         assert!(segment.metadata().is_ok(), "{segment:?}");
         let children = children(self.child.id());
@@ -119,7 +119,7 @@ impl Daemon {
         }
     }
 
-    pub async fn channel(&self, socket: &str) -> Channel {
+    pub(crate) async fn channel(&self, socket: &str) -> Channel {
         let path = self.folder.path().join("run").join(socket);
         let connector = tower::service_fn(move |_| {
             let path = path.clone();
@@ -131,11 +131,11 @@ impl Daemon {
             .unwrap()
     }
 
-    pub async fn jobs(&self) -> JobServiceClient<Channel> {
+    pub(crate) async fn jobs(&self) -> JobServiceClient<Channel> {
         JobServiceClient::new(self.channel("jobs.sock").await)
     }
 
-    pub async fn status(&self) -> v1::DaemonStatus {
+    pub(crate) async fn status(&self) -> v1::DaemonStatus {
         let mut client = DaemonServiceClient::new(self.channel("jobs.sock").await);
         client.get_status(v1::GetStatusRequest {}).await.unwrap().into_inner()
     }
@@ -154,7 +154,7 @@ impl Drop for Daemon {
 }
 
 /// Process ids of a process's children.
-pub fn children(pid: u32) -> Vec<u32> {
+pub(crate) fn children(pid: u32) -> Vec<u32> {
     let parent = |pid: u32| {
         let mut stat = String::new();
         std::fs::File::open(format!("/proc/{pid}/stat"))
