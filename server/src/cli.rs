@@ -14,7 +14,12 @@ const PRIVATE_IDLE_SECONDS: u64 = 300;
 
 /// Shading server for out-of-core point-based global illumination.
 #[derive(Debug, Parser)]
-#[command(name = "pbgi-server", version, args_conflicts_with_subcommands = true)]
+#[command(
+    name = "pbgi-server",
+    version,
+    args_conflicts_with_subcommands = true,
+    args_override_self = true
+)]
 pub(crate) struct Arguments {
     #[command(subcommand)]
     pub(crate) command: Option<Command>,

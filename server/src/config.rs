@@ -139,7 +139,8 @@ mod tests {
 
     #[test]
     fn nonsense_is_refused_by_name() {
-        let cases: [(fn(&mut Options), &str); 4] = [
+        type Change = fn(&mut Options);
+        let cases: [(Change, &str); 4] = [
             (|o| o.workers = 0, "--workers is 0, must be from 1 to 64"),
             (|o| o.workers = 65, "--workers is 65"),
             (|o| o.nodes_per_page = 1, "--nodes-per-page is 1"),

@@ -14,6 +14,7 @@ use pbgi_cache::{CacheOwner, Segment};
 use pbgi_store::{OsVolume, sweep_scratch};
 use std::fs;
 use std::io;
+use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -57,7 +58,9 @@ fn bind(path: &Path) -> Result<UnixListener, ServerError> {
         }
         Err(_) => {}
     }
-    UnixListener::bind(path).map_err(ServerError::io("bind a socket", path))
+    let listener = UnixListener::bind(path).map_err(ServerError::io("bind a socket", path))?;
+    fs::set_permissions(path, fs::Permissions::from_mode(0o600)).map_err(ServerError::io("protect a socket", path))?;
+    Ok(listener)
 }
 
 /// How far the daemon is told to stop.

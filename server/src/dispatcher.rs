@@ -320,10 +320,8 @@ impl Dispatcher {
         state.parked = slots;
         let none_left = slots == state.seats.len();
         self.healthy.send_replace(!none_left);
-        if none_left {
-            let reason = format!("no worker can be started: {reason}");
-            self.dispatch(&mut state, Event::Workless { reason }, None);
-        }
+        let reason = none_left.then(|| format!("no worker can be started: {reason}"));
+        self.dispatch(&mut state, Event::Workless { reason }, None);
     }
 
     /// Checks who speaks on the queue.

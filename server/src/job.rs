@@ -127,7 +127,8 @@ impl Request {
     }
 }
 
-fn check_path(field: &str, path: &Path) -> Result<(), JobError> {
+/// Checks a path that a client names.
+pub(crate) fn check_path(field: &str, path: &Path) -> Result<(), JobError> {
     let bytes = path.as_os_str().as_encoded_bytes();
     let wrong = if bytes.is_empty() {
         "is empty"
@@ -237,7 +238,8 @@ mod tests {
             density: Density::Default,
         };
         Request::Build(good.clone()).validate().unwrap();
-        let cases: [(fn(&mut BuildTask), &str); 6] = [
+        type Change = fn(&mut BuildTask);
+        let cases: [(Change, &str); 6] = [
             (|task| task.inputs.clear(), "0 inputs"),
             (|task| task.inputs = vec!["in.ply".into()], "input path is not absolute"),
             (|task| task.output = "/".into(), "output path names no file"),

@@ -61,6 +61,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
     }
     init_tracing(arguments)?;
     process::abort_on_core_panic();
+    process::prefer_to_live();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(cli::RUNTIME_THREADS)
         .enable_all()
@@ -71,6 +72,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
         })?;
     let outcome = runtime.block_on(async {
         let listeners = Listeners::bind(&config)?;
+        process::make_outputs_readable();
         let stop = stop_on_signals()?;
         let private = arguments.private;
         let ready = || {

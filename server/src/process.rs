@@ -33,6 +33,17 @@ pub(crate) fn make_files_private() {
     umask(Mode::from_bits_truncate(0o077));
 }
 
+/// From now on outputs are made, which the user's group may read; what must stay ours says so itself.
+pub(crate) fn make_outputs_readable() {
+    umask(Mode::from_bits_truncate(0o027));
+}
+
+/// Asks the kernel to take others first when memory runs out; only the privileged may.
+pub(crate) fn prefer_to_live() {
+    // Refused for most, and then nothing is lost.
+    let _ = fs::write("/proc/self/oom_score_adj", "-500");
+}
+
 /// Sends standard error to a file and takes standard input away.
 pub(crate) fn log_to(path: &Path) -> Result<(), ServerError> {
     let io = |source| ServerError::Io {

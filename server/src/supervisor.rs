@@ -178,7 +178,6 @@ pub struct Supervisor<N> {
     slots: Vec<Slot>,
     builds: Builds,
     parked: usize,
-    stopping: bool,
 }
 
 impl<N: Nursery + 'static> Supervisor<N> {
@@ -196,7 +195,6 @@ impl<N: Nursery + 'static> Supervisor<N> {
             slots,
             builds: Builds::default(),
             parked: 0,
-            stopping: false,
         };
         let thread = std::thread::Builder::new()
             .name("supervisor".into())
@@ -215,6 +213,7 @@ impl<N: Nursery + 'static> Supervisor<N> {
                     self.stop();
                     // Nobody waits any more: they gave up.
                     let _ = done.send(());
+                    return;
                 }
                 Ok(command) => self.obey(command),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -225,10 +224,9 @@ impl<N: Nursery + 'static> Supervisor<N> {
 
     fn pause(&self, now: Instant) -> Duration {
         let spawn = self.slots.iter().filter_map(Slot::spawn_at).min();
-        let pause = spawn.map_or(limits::REAP_POLL, |at| {
+        spawn.map_or(limits::REAP_POLL, |at| {
             at.saturating_duration_since(now).min(limits::REAP_POLL)
-        });
-        if self.stopping { limits::BACKOFF[1] } else { pause }
+        })
     }
 
     fn obey(&mut self, command: Command) {
@@ -255,9 +253,6 @@ impl<N: Nursery + 'static> Supervisor<N> {
     }
 
     fn spawn_due(&mut self, now: Instant) {
-        if self.stopping {
-            return;
-        }
         for slot in &mut self.slots {
             if slot.spawn_at().is_some_and(|at| at <= now) {
                 slot.spawn(&self.plan, &mut self.nursery, now);
@@ -278,7 +273,6 @@ impl<N: Nursery + 'static> Supervisor<N> {
     }
 
     fn stop(&mut self) {
-        self.stopping = true;
         self.builds.stop_all();
         for slot in &mut self.slots {
             slot.stop(&mut self.nursery);

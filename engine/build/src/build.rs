@@ -1,4 +1,4 @@
-//! [`build`]: reads, sorts, constructs, publishes.
+//! [`build()`]: reads, sorts, constructs, publishes.
 
 use crate::budget::Budget;
 use crate::content_hash::ContentHash;
@@ -42,8 +42,8 @@ impl Default for BuildHost {
     }
 }
 
-/// Builds the octree of all points of `stream` and publishes it as `request.output`. `observer` is called for every few thousand
-/// points; `Break` cancels the build.
+/// Builds the octree of all points of `stream` and publishes it as `request.output`. `observer` is called for every few
+/// thousand points; `Break` cancels the build.
 ///
 /// # Errors
 /// See [`BuildError`]. Nothing is left behind then: no output, no temporary, no scratch.
@@ -55,10 +55,10 @@ pub fn build<S: PointStream + ?Sized>(
     build_on(stream, request, &BuildHost::default(), observer)
 }
 
-/// As [`build`], on a host of choice.
+/// As [`build()`], on a host of choice.
 ///
 /// # Errors
-/// As [`build`].
+/// As [`build()`].
 pub fn build_on<S: PointStream + ?Sized>(
     stream: &mut S,
     request: &BuildRequest,

@@ -1,4 +1,5 @@
-//! [`ContentHash`]: the 128-bit identity of an octree, from the points in their order and everything else that decides its bytes.
+//! [`ContentHash`]: the 128-bit identity of an octree, from the points in their order and everything else that decides
+//! its bytes.
 
 use pbgi_core::{BuildId, BuildSettings, PointRecord, Quantizer};
 

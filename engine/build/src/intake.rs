@@ -114,8 +114,8 @@ pub(crate) struct Intake {
     pub(crate) seconds: StageSeconds,
 }
 
-/// Takes everything from `stream`. Where it does not know its bounds and the points do not fit the memory, it is read twice:
-/// runs need the lattice.
+/// Takes everything from `stream`. Where it does not know its bounds and the points do not fit the memory, it is read
+/// twice: runs need the lattice.
 pub(crate) fn take_in<S: PointStream + ?Sized>(
     stream: &mut S,
     sorter: &mut Sorter,

@@ -78,6 +78,11 @@ impl<T: Clone, S> Flights<T, S> {
         self.aloft.contains_key(&key)
     }
 
+    /// How many of the loads in progress are for a key that `which` accepts.
+    pub fn count(&self, which: impl Fn(u64) -> bool) -> usize {
+        self.aloft.keys().filter(|&&key| which(key)).count()
+    }
+
     /// Joins the load of `key`, or opens it.
     pub fn join(&mut self, key: u64, follower: S) -> Role<T> {
         if let Some((flight, followers)) = self.aloft.get_mut(&key) {

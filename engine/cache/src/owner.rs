@@ -138,6 +138,7 @@ impl CacheOwner {
     }
 
     /// Makes a page resident and pins it for the worker in `seat`, on behalf of job number `job`.
+    /// Of the loads that may be in flight, one scene gets half at most.
     ///
     /// `load` is called, outside every lock, if the page has to be read; its buffer has exactly the page's bytes. Of
     /// all who ask for a page at once one loads, and all get its outcome. A seat fetches one page at a time.
@@ -283,7 +284,7 @@ impl CacheOwner {
                 let origin = state.count_hit(map, frame, job, false);
                 return Ok(Admission::Done(Fetched { frame, origin }));
             }
-            if state.flights.len() < self.layout().loads_in_flight_max() as usize {
+            if state.has_load_for(key.mount) {
                 let (claimed, freed) = state.claim(map, tag);
                 self.resident_bytes.fetch_sub(freed, Ordering::Relaxed);
                 if let Some(frame) = claimed {

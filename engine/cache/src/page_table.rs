@@ -33,8 +33,11 @@ pub(crate) fn find(table: &[AtomicU64], hash: u32, mut holds: impl FnMut(FrameId
 pub(crate) fn insert(table: &[AtomicU64], hash: u32, frame: FrameId) {
     let mask = table.len() - 1;
     let mut at = hash as usize & mask;
+    let mut probes = 0;
     while table[at].load(Ordering::Relaxed) != 0 {
         at = (at + 1) & mask;
+        probes += 1;
+        assert!(probes < table.len(), "the page table is full");
     }
     table[at].store(u64::from(hash) << 32 | u64::from(frame.0 + 1), Ordering::Relaxed);
 }

@@ -31,6 +31,7 @@ pub(crate) struct PoolState {
     workers: u8,
     frames: u32,
     local_frames: u32,
+    loads_max: usize,
     pub(crate) epochs: Vec<u32>,
     pub(crate) flights: Flights<Result<FrameId, CacheError>, Seat>,
     pub(crate) jobs: HashMap<u64, JobRecord>,
@@ -63,6 +64,7 @@ impl PoolState {
             workers: layout.workers() as u8,
             frames: pool.frames,
             local_frames: pool.local_frames,
+            loads_max: layout.loads_in_flight_max() as usize,
             epochs: vec![0; layout.workers() as usize],
             flights: Flights::default(),
             jobs: HashMap::new(),
@@ -231,10 +233,22 @@ impl PoolState {
 
     // Mounts
 
+    /// Loads in flight for a scene.
+    fn loads_of(&self, mount: MountId) -> usize {
+        self.flights.count(|key| Tag(key).mount() == mount)
+    }
+
+    /// Whether another load may start: one scene on slow storage takes half of the loads at most, so that the others
+    /// keep flowing.
+    pub(crate) fn has_load_for(&self, mount: MountId) -> bool {
+        self.flights.len() < self.loads_max && self.loads_of(mount) < self.loads_max.div_ceil(2)
+    }
+
     /// Whether the slot is empty and no page of an earlier scene of the same generation is left.
     pub(crate) fn mount_is_free(&self, map: &SegmentMap, mount: MountId) -> bool {
         let of_mount = |&frame: &FrameId| load_tag(&map.frame_header(self.kind, frame).tag).mount() == mount;
-        matches!(self.mounts.get(usize::from(mount.slot)), Some(None)) && !self.doomed.iter().any(of_mount)
+        let free = matches!(self.mounts.get(usize::from(mount.slot)), Some(None));
+        free && !self.doomed.iter().any(of_mount) && self.loads_of(mount) == 0
     }
 
     pub(crate) fn mount(&mut self, mount: MountId, page_bytes: usize, pages: u64) {

@@ -357,6 +357,68 @@ fn unmount_while_loading_gives_the_frame_back() {
 }
 
 #[test]
+fn scene_on_slow_storage_leaves_loads_to_the_others() {
+    let owner = owner(4, 64, 4, 4);
+    owner.mount(OTHER_MOUNT, &scene(PAGES)).unwrap();
+    let (begun, done) = (Barrier::new(3), Barrier::new(3));
+    let third = AtomicU32::new(0);
+    std::thread::scope(|scope| {
+        for slot in 0..2 {
+            let (owner, begun, done) = (&owner, &begun, &done);
+            scope.spawn(move || {
+                let key = node(u32::from(slot));
+                let load = |page: &mut [u8]| {
+                    begun.wait();
+                    done.wait();
+                    fill(page, key)
+                };
+                owner.fetch(owner.seat(slot).unwrap(), key, 1, load).unwrap();
+            });
+        }
+        begun.wait();
+        scope.spawn(|| {
+            let load = |page: &mut [u8]| {
+                third.store(1, Ordering::Relaxed);
+                fill(page, node(2))
+            };
+            owner.fetch(owner.seat(2).unwrap(), node(2), 1, load).unwrap();
+        });
+        for page in 0..4 {
+            let key = pbgi_core::PageKey {
+                mount: OTHER_MOUNT,
+                ..node(page)
+            };
+            owner
+                .fetch(owner.seat(3).unwrap(), key, 2, |page| fill(page, key))
+                .unwrap();
+        }
+        std::thread::sleep(Duration::from_millis(20));
+        assert_eq!(
+            third.load(Ordering::Relaxed),
+            0,
+            "half of the loads is enough for one scene"
+        );
+        done.wait();
+    });
+    assert_eq!(owner.counters().node.loads, 7);
+}
+
+#[test]
+fn id_of_a_scene_that_is_still_being_loaded_is_not_given_again() {
+    let owner = owner(1, 16, 4, 2);
+    let outcome = owner.fetch(owner.seat(0).unwrap(), point(1), 1, |page| {
+        owner.unmount(MOUNT);
+        assert!(matches!(
+            owner.mount(MOUNT, &scene(PAGES)),
+            Err(CacheError::MountTaken(MOUNT))
+        ));
+        fill(page, point(1))
+    });
+    assert!(matches!(outcome, Err(CacheError::NotMounted(MOUNT))));
+    owner.mount(MOUNT, &scene(PAGES)).unwrap();
+}
+
+#[test]
 fn pages_that_do_not_exist_or_do_not_fit_are_refused() {
     let owner = owner(1, 16, 4, 2);
     let fetch = |key| owner.fetch(owner.seat(0).unwrap(), key, 1, |_| panic!("loaded"));

@@ -1,5 +1,7 @@
 //! G-buffers: equal to the independent reference, read under many names, never larger than the limits.
 
+#![allow(clippy::unwrap_used, reason = "a step that fails is a test that fails")]
+
 mod common;
 
 use common::{assert_says, shared};

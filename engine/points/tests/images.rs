@@ -1,8 +1,10 @@
 //! Pictures in and out.
 
+#![allow(clippy::unwrap_used, reason = "a step that fails is a test that fails")]
+
 mod common;
 
-use common::{assert_says, shared};
+use common::{assert_says, mutate, shared};
 use pbgi_points::{LayeredImage, Precision, ToneMap, Window, read_environment, write_png};
 use std::fs;
 use std::path::Path;
@@ -102,4 +104,19 @@ fn bad_light_probes_are_named() {
     assert_says(read_environment(&hdr), &["number of pixels", "probe.hdr"]);
     fs::write(&hdr, b"not a picture").unwrap();
     assert_says(read_environment(&hdr), &["not a usable HDR", "probe.hdr"]);
+}
+
+#[test]
+fn mutations_of_an_exr_file_are_survived() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.exr");
+    let mut image = LayeredImage::new(40, 40);
+    image.add_xyz("P", Precision::Float, &vec![[1.0, 2.0, 3.0]; 1600]);
+    image.add("A", Precision::Half, vec![1.0; 1600]);
+    image.write_exr(&path).unwrap();
+    let bytes = fs::read(&path).unwrap();
+    mutate(&bytes, 0..bytes.len(), 400, |broken| {
+        fs::write(&path, broken).unwrap();
+        drop(LayeredImage::read_exr(&path));
+    });
 }

@@ -1,8 +1,10 @@
 //! PLY clouds: every encoding, every error named, nothing half-read.
 
+#![allow(clippy::unwrap_used, reason = "a step that fails is a test that fails")]
+
 mod common;
 
-use common::{assert_says, collect};
+use common::{assert_says, collect, mutate};
 use pbgi_core::point::Sides;
 use pbgi_core::{PointRecord, PointStream};
 use pbgi_points::ply::{PlyPoints, PlyWriter};
@@ -50,7 +52,7 @@ fn ascii_and_both_binary_encodings_give_the_same_points() {
     let big: Vec<u8> = rows
         .iter()
         .flatten()
-        .flat_map(|value| value.to_bits().to_be_bytes())
+        .flat_map(|value| value.to_bits().swap_bytes().to_le_bytes())
         .collect();
     let mut all = Vec::new();
     for (format, body) in [
@@ -299,4 +301,20 @@ fn inputs_of_several_kinds_make_one_stream() {
         &["\"fbx\"", "convert it", "scene.fbx"],
     );
     assert_says(open_input(&[], &options).map(drop), &["no input file"]);
+}
+
+#[test]
+fn mutations_of_a_cloud_are_survived() {
+    let folder = tempfile::tempdir().unwrap();
+    let body: Vec<u8> = (0..20).flat_map(numbers).flat_map(f32::to_le_bytes).collect();
+    let binary = [header("binary_little_endian", 20, HEADER), body].concat();
+    let text: String = (0..20)
+        .map(|i| numbers(i).map(|value| value.to_string()).join(" ") + "\n")
+        .collect();
+    let ascii = [header("ascii", 20, HEADER), text.into_bytes()].concat();
+    for bytes in [binary, ascii] {
+        mutate(&bytes, 0..bytes.len(), 300, |broken| {
+            drop(read(&write(folder.path(), &[broken])));
+        });
+    }
 }

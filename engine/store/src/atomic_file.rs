@@ -38,8 +38,8 @@ impl AtomicFile {
     /// Opens a temporary beside `path`.
     ///
     /// # Errors
-    /// [`StoreError::Exists`] if the name is taken and `overwrite` refuses, [`StoreError::Foreign`] if it is taken by something
-    /// that is no file, [`StoreError::NoSpace`], [`StoreError::Io`].
+    /// [`StoreError::Exists`] if the name is taken and `overwrite` refuses, [`StoreError::Foreign`] if it is taken by
+    /// something that is no file, [`StoreError::NoSpace`], [`StoreError::Io`].
     pub fn create(path: &Path, overwrite: Overwrite) -> Result<Self, StoreError> {
         Self::create_on(&(Arc::new(OsVolume) as Arc<dyn Volume>), path, overwrite)
     }
@@ -85,8 +85,8 @@ impl AtomicFile {
     /// Makes the content durable and gives it its name.
     ///
     /// # Errors
-    /// [`StoreError::Exists`] if the name was taken meanwhile and `overwrite` refuses; [`StoreError::Io`], [`StoreError::NoSpace`],
-    /// [`StoreError::Abandoned`]. Nothing is left behind then.
+    /// [`StoreError::Exists`] if the name was taken meanwhile and `overwrite` refuses; [`StoreError::Io`],
+    /// [`StoreError::NoSpace`], [`StoreError::Abandoned`]. Nothing is left behind then.
     pub fn publish(self) -> Result<(), StoreError> {
         self.file.sync()?;
         publish(self.volume.as_ref(), &self.temporary, &self.target, self.overwrite)

@@ -19,7 +19,10 @@ pub enum StoreError {
         source: io::Error,
     },
     /// The disk or the quota is full.
-    #[error("no space left: {needed} bytes needed, {free} bytes free; make room or choose another disk, at {}", .path.display())]
+    #[error(
+        "no space left: {needed} bytes needed, {free} bytes free; make room or choose another disk, at {}",
+        .path.display()
+    )]
     NoSpace {
         /// Bytes that had to be written.
         needed: u64,
@@ -49,7 +52,10 @@ pub enum StoreError {
         path: PathBuf,
     },
     /// The bytes are not those that were written.
-    #[error("corrupt {place}: expected {expected}, found {actual}; restore the file or build the scene again, in {}", .path.display())]
+    #[error(
+        "corrupt {place}: expected {expected}, found {actual}; restore the file or build the scene again, in {}",
+        .path.display()
+    )]
     Corrupt {
         /// Which part.
         place: String,
@@ -61,7 +67,10 @@ pub enum StoreError {
         path: PathBuf,
     },
     /// The file is whole but not for this program, or not for its neighbours.
-    #[error("unusable {what}: this program needs {expected}, the file has {actual}; build the scene again, in {}", .path.display())]
+    #[error(
+        "unusable {what}: this program needs {expected}, the file has {actual}; build the scene again, in {}",
+        .path.display()
+    )]
     Mismatch {
         /// Which property.
         what: &'static str,

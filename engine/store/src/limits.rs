@@ -14,8 +14,8 @@ pub const CHECKSUM_BYTES: u64 = 4;
 /// Bytes a page file gathers before it writes, unless one page is larger.
 pub const WRITE_BUFFER_BYTES: usize = 1 << 20;
 
-/// Records in a block of a run: 256 KiB, large enough to read at the speed of the disk, small enough that 64 MB merge 190
-/// runs at once.
+/// Records in a block of a run: 256 KiB, large enough to read at the speed of the disk, small enough that 64 MB merge
+/// 190 runs at once.
 pub const RUN_BLOCK_RECORDS: usize = 8192;
 
 /// Longest manifest read: a real one has about 1 KiB.

@@ -60,8 +60,8 @@ impl PageLayout {
         self.page_offset(pages) + pages * CHECKSUM_BYTES
     }
 
-    /// Slot where a group of `count` records goes if the file holds `slots` so far: the next one, or the first of the next
-    /// page where the group would straddle two.
+    /// Slot where a group of `count` records goes if the file holds `slots` so far: the next one, or the first of the
+    /// next page where the group would straddle two.
     pub fn group_slot(&self, slots: u64, count: usize) -> u64 {
         let per_page = u64::from(self.records_per_page);
         let in_page = slots % per_page;

@@ -9,8 +9,8 @@ use pbgi_core::BuildId;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Writes `[header | pages | checksums]` front to back; the header last, so that an unfinished file never opens. Memory:
-/// one mebibyte or one page, and four bytes a page.
+/// Writes `[header | pages | checksums]` front to back; the header last, so that an unfinished file never opens.
+/// Memory: one mebibyte or one page, and four bytes a page.
 pub struct PageFileWriter {
     file: DataFile,
     layout: PageLayout,
@@ -65,8 +65,8 @@ impl PageFileWriter {
         Ok(first)
     }
 
-    /// Appends records that must share a page, behind zeroed slots where the current page has no room; returns the slot of
-    /// the first one.
+    /// Appends records that must share a page, behind zeroed slots where the current page has no room; returns the slot
+    /// of the first one.
     ///
     /// # Errors
     /// As [`Self::append`]; [`StoreError::Invalid`] if the group is larger than a page.

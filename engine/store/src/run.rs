@@ -1,7 +1,7 @@
 //! Sort runs: sorted points on scratch, written once, read once, front to back, then deleted.
 //!
-//! A run is a file of plain records. It never outlives the process that wrote it, so its length and the checksum of every
-//! block stay in memory.
+//! A run is a file of plain records. It never outlives the process that wrote it, so its length and the checksum of
+//! every block stay in memory.
 
 use crate::data_file::DataFile;
 use crate::error::StoreError;

@@ -18,8 +18,8 @@ pub const NODES_NAME: &str = "nodes.pages";
 /// Name of the point file in a scene's folder.
 pub const POINTS_NAME: &str = "points.pages";
 
-/// An open scene: everything but the content of its pages has been checked, and its files stay open, so a scene that takes
-/// its name later does not disturb it. Pages may be read from any thread.
+/// An open scene: everything but the content of its pages has been checked, and its files stay open, so a scene that
+/// takes its name later does not disturb it. Pages may be read from any thread.
 pub struct Scene {
     info: SceneInfo,
     nodes: PageFile,
@@ -31,8 +31,8 @@ impl Scene {
     /// Opens the folder `NAME.pbgi`.
     ///
     /// # Errors
-    /// [`StoreError::Missing`], [`StoreError::Foreign`] if it is no scene, [`StoreError::Mismatch`] for another version or files
-    /// of different builds, [`StoreError::Corrupt`] for damage, [`StoreError::Io`].
+    /// [`StoreError::Missing`], [`StoreError::Foreign`] if it is no scene, [`StoreError::Mismatch`] for another version
+    /// or files of different builds, [`StoreError::Corrupt`] for damage, [`StoreError::Io`].
     pub fn open(path: &Path) -> Result<Self, StoreError> {
         Self::open_on(&(Arc::new(OsVolume) as Arc<dyn Volume>), path)
     }
@@ -94,8 +94,8 @@ impl Scene {
     /// Reads a page and checks its sum; `out` has exactly [`SceneInfo::page_bytes`] bytes.
     ///
     /// # Errors
-    /// [`StoreError::PageRange`], [`StoreError::Corrupt`] naming file and page, [`StoreError::Io`]; [`StoreError::Invalid`] for
-    /// a buffer of another length. The content of `out` is then unspecified.
+    /// [`StoreError::PageRange`], [`StoreError::Corrupt`] naming file and page, [`StoreError::Io`];
+    /// [`StoreError::Invalid`] for a buffer of another length. The content of `out` is then unspecified.
     pub fn read_page(&self, kind: PageKind, page: PageNo, out: &mut [u8]) -> Result<(), StoreError> {
         match kind {
             PageKind::Node => self.nodes.read_page(page, out),

@@ -16,7 +16,8 @@ use pbgi_core::{BuildSettings, NodeIndex, NodeRecord, PageKind, PointIndex, Poin
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A scene that is being written, in a folder `NAME.pbgi.tmp-<hex>` beside its target. Dropping it unpublished deletes it.
+/// A scene that is being written, in a folder `NAME.pbgi.tmp-<hex>` beside its target. Dropping it unpublished deletes
+/// it.
 pub struct SceneWriter {
     // Fields drop in this order: the files are closed before the folder goes.
     nodes: PageFileWriter,
@@ -44,8 +45,8 @@ impl SceneWriter {
     /// Creates the temporary folder and its files. The settings fix the page sizes.
     ///
     /// # Errors
-    /// [`StoreError::Exists`] if `output` is taken and `overwrite` refuses, [`StoreError::Foreign`] if it is taken by something
-    /// that is no scene, [`StoreError::NoSpace`], [`StoreError::Io`].
+    /// [`StoreError::Exists`] if `output` is taken and `overwrite` refuses, [`StoreError::Foreign`] if it is taken by
+    /// something that is no scene, [`StoreError::NoSpace`], [`StoreError::Io`].
     pub fn create(
         volume: &Arc<dyn Volume>,
         output: &Path,
@@ -130,12 +131,13 @@ impl SceneWriter {
         Ok(NodeIndex(self.nodes.append_group(siblings)? as u32))
     }
 
-    /// Writes the manifest, makes everything durable and gives the folder its name. Returns the bytes of all files. What had
-    /// the name before is deleted; if that fails, the next writer of the same name does it.
+    /// Writes the manifest, makes everything durable and gives the folder its name. Returns the bytes of all files.
+    /// What had the name before is deleted; if that fails, the next writer of the same name does it.
     ///
     /// # Errors
-    /// [`StoreError::Exists`] if the name was taken meanwhile and `overwrite` refuses; [`StoreError::Invalid`] if `info` does not
-    /// describe what was appended; [`StoreError::NoSpace`], [`StoreError::Io`]. Nothing is left behind then.
+    /// [`StoreError::Exists`] if the name was taken meanwhile and `overwrite` refuses; [`StoreError::Invalid`] if
+    /// `info` does not describe what was appended; [`StoreError::NoSpace`], [`StoreError::Io`]. Nothing is left behind
+    /// then.
     pub fn finish(self, info: &SceneInfo) -> Result<u64, StoreError> {
         let written = (self.points.slots(), self.nodes.slots());
         if written != (info.point_count, info.node_slots) {

@@ -1,6 +1,7 @@
 //! Names of things that are not finished, how they become final, and how leftovers are found.
 //!
-//! A temporary is `NAME.tmp-` and sixteen hexadecimal digits beside its target, locked by its owner while that one lives.
+//! A temporary is `NAME.tmp-` and sixteen hexadecimal digits beside its target, locked by its owner while that one
+//! lives.
 
 use crate::atomic_file::Overwrite;
 use crate::data_file::{retry, write_error};
@@ -49,8 +50,8 @@ pub(crate) fn is_suffix(digits: &[u8]) -> bool {
     digits.len() == DIGITS && digits.iter().all(|d| matches!(d, b'0'..=b'9' | b'a'..=b'f'))
 }
 
-/// Creates something under a fresh temporary name and locks it. The sweep of another process may remove it in between: then
-/// the next name is tried.
+/// Creates something under a fresh temporary name and locks it. The sweep of another process may remove it in between:
+/// then the next name is tried.
 pub(crate) fn create_locked<T>(
     volume: &dyn Volume,
     mut name: impl FnMut() -> Result<PathBuf, StoreError>,
@@ -82,7 +83,8 @@ pub(crate) fn create_locked<T>(
     })
 }
 
-/// Gives a finished and synced temporary its final name. On success the old content, if there was any, has the temporary name.
+/// Gives a finished and synced temporary its final name. On success the old content, if there was any, has the
+/// temporary name.
 ///
 /// # Errors
 /// [`StoreError::Exists`] and others; the final name is then as it was before.

@@ -1,7 +1,7 @@
 //! The seam between this crate and the operating system: [`Storage`] for the bytes of a file, [`Volume`] for names.
 //!
-//! Verbs are positional and answer with plain [`io::Error`]; context, retries and the refusal to go on after a failed write
-//! are added by [`crate::DataFile`], so they hold for every implementation.
+//! Verbs are positional and answer with plain [`io::Error`]; context, retries and the refusal to go on after a failed
+//! write are added by [`crate::DataFile`], so they hold for every implementation.
 
 use std::any::Any;
 use std::ffi::OsString;

@@ -2,7 +2,7 @@
 
 use super::{Dispatcher, Record};
 use crate::error::{JobError, JobErrorKind};
-use crate::job::{JobState, JobStatus, Request, check_job_id, no_such_job};
+use crate::job::{JobState, JobStatus, Request, check_job_id, check_path, no_such_job};
 use crate::limits;
 use crate::mounts::MountStatus;
 use crate::scheduler::{Event, JobNo};
@@ -151,6 +151,7 @@ impl Dispatcher {
     /// # Errors
     /// It is none, or damaged.
     pub async fn scene(self: &Arc<Self>, path: PathBuf) -> Result<SceneInfo, JobError> {
+        check_path("scene", &path)?;
         let mounts = self.mounts.clone();
         let opened = tokio::task::spawn_blocking(move || mounts.open(&path)).await;
         let opened = opened.map_err(|error| JobError::new(JobErrorKind::Internal, error.to_string()))?;

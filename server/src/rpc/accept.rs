@@ -56,7 +56,6 @@ pub(super) fn connections(listener: UnixListener) -> ReceiverStream<io::Result<C
 }
 
 /// Lets in our own user only.
-#[expect(clippy::result_large_err, reason = "the interceptor's signature is tonic's")]
 pub(super) fn check_peer(request: Request<()>) -> Result<Request<()>, Status> {
     let peer = request
         .extensions()

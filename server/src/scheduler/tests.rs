@@ -476,3 +476,30 @@ fn no_tile_is_lost_none_counted_twice_and_every_job_ends() {
         "only {succeeded} of {ended} jobs succeeded: the simulation is too rough"
     );
 }
+
+#[test]
+fn without_workers_pictures_fail_with_the_reason_until_one_asks() {
+    let (mut scheduler, now) = shading(2);
+    let reason = Some("no program".to_owned());
+    let effects = scheduler.on(Event::Workless { reason }, now);
+    let end = End::Failed("no program".into());
+    assert_eq!(
+        effects,
+        [Effect::Ended {
+            job: JobNo(1),
+            end: end.clone()
+        }]
+    );
+    let job = JobNo(2);
+    scheduler.on(Event::Submit { job, kind: SHADE }, now);
+    let tiles = vec![0];
+    assert_eq!(
+        scheduler.on(Event::Prepared { job, tiles }, now),
+        [Effect::Ended { job, end }]
+    );
+    grant(&mut scheduler, seat(0, 1), now);
+    let job = JobNo(3);
+    scheduler.on(Event::Submit { job, kind: SHADE }, now);
+    let tiles = vec![0];
+    assert_eq!(scheduler.on(Event::Prepared { job, tiles }, now), [Effect::Wake]);
+}

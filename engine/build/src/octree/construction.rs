@@ -1,4 +1,5 @@
-//! [`construct`]: the depth-first traversal that makes nodes of sorted points (algorithm of paper sections 4.1 and 4.2).
+//! [`construct`]: the depth-first traversal that makes nodes of sorted points (algorithm of paper sections 4.1 and
+//! 4.2).
 
 use crate::error::BuildError;
 use crate::octree::window::{BatchSource, PointWindow};

@@ -41,7 +41,8 @@ impl<'a> PointWindow<'a> {
         self.point_in(voxel, 0)
     }
 
-    /// Whether more than `leaf_max` points lie in `voxel`: points are sorted, so one look at the last of the window tells.
+    /// Whether more than `leaf_max` points lie in `voxel`: points are sorted, so one look at the last of the window
+    /// tells.
     #[inline]
     pub fn overflows(&self, voxel: Voxel) -> bool {
         self.point_in(voxel, self.leaf_max)

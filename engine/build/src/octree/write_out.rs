@@ -1,4 +1,5 @@
-//! [`WriteOutQueue`]: the nodes of one chunk, kept until the node that owns it is finalized, then written level by level.
+//! [`WriteOutQueue`]: the nodes of one chunk, kept until the node that owns it is finalized, then written level by
+//! level.
 
 use pbgi_core::{NodeIndex, NodeKind, NodeRecord};
 use pbgi_store::PageLayout;
@@ -35,16 +36,17 @@ impl WriteOutQueue {
         }
     }
 
-    /// Takes the children of one node, `level` levels below the owner, counted from 0 for its own children. Parents are pushed
-    /// in the same order, so the k-th group of a level belongs to the k-th inner node of the level above.
+    /// Takes the children of one node, `level` levels below the owner, counted from 0 for its own children. Parents are
+    /// pushed in the same order, so the k-th group of a level belongs to the k-th inner node of the level above.
     pub fn push(&mut self, level: usize, group: &[NodeRecord]) {
         let level = &mut self.levels[level];
         level.nodes.extend_from_slice(group);
         level.groups.push(group.len() as u8);
     }
 
-    /// Gives every group its place in a file that holds `slots` slots so far, and every node the place of its children. Children of the
-    /// last level have been written before and keep theirs. Returns the place of the owner's children, and the slots then taken.
+    /// Gives every group its place in a file that holds `slots` slots so far, and every node the place of its children.
+    /// Children of the last level have been written before and keep theirs. Returns the place of the owner's children,
+    /// and the slots then taken.
     pub fn place(&mut self, layout: &PageLayout, slots: u64) -> (u64, u64) {
         let mut end = slots;
         let mut owner_children = slots;

@@ -9,7 +9,8 @@ use rdst::{RadixKey, RadixSort};
 /// Memory a point needs while it is sorted: itself, its key, and the sort's second copy of the key.
 pub const BYTES_PER_POINT: u64 = (size_of::<PointRecord>() + 2 * size_of::<SortKey>()) as u64;
 
-/// Points in a chunk of the buffer, a power of two: 2 MiB, so that the buffer grows without copying and its end wastes little.
+/// Points in a chunk of the buffer, a power of two: 2 MiB, so that the buffer grows without copying and its end wastes
+/// little.
 const CHUNK_POINTS: usize = 1 << 16;
 
 /// Points in the order of arrival, never more than `capacity`.

@@ -13,8 +13,8 @@ pub struct Merge {
     runs: Vec<Cursor>,
     /// Code of the next point of each run, apart from the runs so that comparing touches little memory.
     codes: Vec<u64>,
-    /// `losers[i]`, i >= 1: the run that lost the comparison at inner node i; its children are nodes 2 i and 2 i + 1, node
-    /// `runs + r` is the leaf of run r.
+    /// `losers[i]`, i >= 1: the run that lost the comparison at inner node i; its children are nodes 2 i and 2 i + 1,
+    /// node `runs + r` is the leaf of run r.
     losers: Vec<usize>,
     winner: usize,
     quantizer: Quantizer,

@@ -1,4 +1,5 @@
-//! Points in the order of the Z-curve, ties by input index: in memory where they fit, else in runs on scratch that are merged.
+//! Points in the order of the Z-curve, ties by input index: in memory where they fit, else in runs on scratch that are
+//! merged.
 
 pub mod buffer;
 pub mod merge;

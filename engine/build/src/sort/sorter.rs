@@ -68,11 +68,12 @@ impl Sorter {
         self.traffic
     }
 
-    /// Sorts the points in memory and writes them to scratch as a run. `expected` is how many points the input says it has.
+    /// Sorts the points in memory and writes them to scratch as a run. `expected` is how many points the input says it
+    /// has.
     ///
     /// # Errors
-    /// [`StoreError::NoSpace`] before anything is written where the runs obviously do not fit; other errors of scratch; those of
-    /// `watch`.
+    /// [`StoreError::NoSpace`] before anything is written where the runs obviously do not fit; other errors of scratch;
+    /// those of `watch`.
     pub fn spill(&mut self, quantizer: &Quantizer, expected: Option<u64>, watch: Watch<'_>) -> Result<(), BuildError> {
         let scratch = match &mut self.scratch {
             Some(scratch) => scratch,
@@ -81,11 +82,8 @@ impl Sorter {
         let spilled: u64 = self.runs.iter().map(Run::records).sum();
         let hinted = expected.map_or(0, |points| (points as f64 * LEN_HINT_TRUST) as u64);
         let left = hinted.saturating_sub(spilled).max(self.buffer.len() as u64);
-        check_room(
-            scratch.free_bytes()?,
-            left * size_of::<PointRecord>() as u64,
-            scratch.path(),
-        )?;
+        let needed = left.saturating_mul(size_of::<PointRecord>() as u64);
+        check_room(scratch.free_bytes()?, needed, scratch.path())?;
         let mut writer = RunWriter::create(scratch, self.traffic.runs)?;
         let sorted = self.buffer.sorted(quantizer);
         for (done, (_, point)) in sorted.iter().enumerate() {

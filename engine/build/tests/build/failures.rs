@@ -1,5 +1,5 @@
-//! Whatever fails, and wherever a build is stopped or killed, there is the right scene or none, nothing is left, and the next try
-//! succeeds.
+//! Whatever fails, and wherever a build is stopped or killed, there is the right scene or none, nothing is left, and
+//! the next try succeeds.
 
 use crate::support::{Cloud, Place, Tree, build_cloud, sheet, small_pages};
 use nix::errno::Errno;
@@ -267,6 +267,9 @@ fn a_killed_build_leaves_no_scene_and_its_scratch_is_swept() {
         sweep_temporaries(&OsVolume, &place.output()).unwrap();
         assert!(place.leftovers(&OsVolume).is_empty());
     }
-    assert!(kills >= 5 && swept_bytes > 0, "{kills} kills, {swept_bytes} bytes swept");
+    assert!(
+        kills >= 5 && swept_bytes > 0,
+        "{kills} kills, {swept_bytes} bytes swept"
+    );
     Tree::audit(&place.open().unwrap(), &cloud().points);
 }

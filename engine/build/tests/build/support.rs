@@ -235,8 +235,8 @@ pub(crate) struct Tree {
 }
 
 impl Tree {
-    /// Checks that every input point lies in exactly one leaf, that every node is where and what it must be, and that clusters
-    /// are the sums of what is below them.
+    /// Checks that every input point lies in exactly one leaf, that every node is where and what it must be, and that
+    /// clusters are the sums of what is below them.
     pub(crate) fn audit(scene: &Scene, input: &[PointRecord]) -> Self {
         let info = scene.info();
         let mut points: Vec<PointRecord> = read_all(scene, PageKind::Point);

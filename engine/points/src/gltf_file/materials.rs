@@ -92,7 +92,8 @@ impl Loader<'_> {
             uv_set: uv_set as usize,
             transform: moved.map(|moved| {
                 let (offset, scale) = (Vec2::from(moved.offset()), Vec2::from(moved.scale()));
-                // The extension turns clockwise in a space whose y points down.
+                // Counter-clockwise as one sees it: v points down. (The sample code of the extension turns the other way;
+                // viewers do it like this.)
                 Affine2::from_translation(offset) * Affine2::from_angle(-moved.rotation()) * Affine2::from_scale(scale)
             }),
             wrap: [wrap(sampler.wrap_s()), wrap(sampler.wrap_t())],

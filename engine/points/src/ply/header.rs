@@ -54,6 +54,24 @@ pub(super) struct Header {
     pub(super) bytes: u64,
 }
 
+impl Encoding {
+    fn parse(path: &Path, name: &str) -> Result<Self, PointsError> {
+        match name {
+            "ascii" => Ok(Self::Ascii),
+            "binary_little_endian" => Ok(Self::LittleEndian),
+            "binary_big_endian" => Ok(Self::BigEndian),
+            other => {
+                let what = format!("PLY format {other:?}");
+                Err(PointsError::unsupported(
+                    path,
+                    what,
+                    "write ascii or binary_little_endian",
+                ))
+            }
+        }
+    }
+}
+
 impl Scalar {
     fn parse(name: &str) -> Option<Self> {
         Some(match name {
@@ -159,19 +177,7 @@ impl Header {
                 ["comment" | "obj_info", ..] | [] => {}
                 ["format", name, "1.0"] => {
                     has_format = true;
-                    header.encoding = match *name {
-                        "ascii" => Encoding::Ascii,
-                        "binary_little_endian" => Encoding::LittleEndian,
-                        "binary_big_endian" => Encoding::BigEndian,
-                        other => {
-                            let what = format!("PLY format {other:?}");
-                            return Err(PointsError::unsupported(
-                                path,
-                                what,
-                                "write ascii or binary_little_endian",
-                            ));
-                        }
-                    };
+                    header.encoding = Encoding::parse(path, name)?;
                 }
                 ["element", name, count] => header.elements.push(Element {
                     name: (*name).to_owned(),

@@ -177,3 +177,28 @@ pub fn assert_says<T>(result: Result<T, PointsError>, parts: &[&str]) {
         assert!(text.contains(part), "{text:?} does not say {part:?}");
     }
 }
+
+/// Changes one byte at a time and hands each damaged file to `read`, which must not panic. Prints the seed; PBGI_SEED reruns.
+pub fn mutate(bytes: &[u8], range: std::ops::Range<usize>, count: usize, mut read: impl FnMut(&[u8])) {
+    let seed = std::env::var("PBGI_SEED").ok().and_then(|seed| seed.parse().ok());
+    let mut state: u64 = seed.unwrap_or(1);
+    println!("PBGI_SEED={state}");
+    let mut next = || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        state >> 33
+    };
+    for _ in 0..count {
+        let mut broken = bytes.to_vec();
+        for _ in 0..1 + next() % 3 {
+            let at = range.start + next() as usize % range.len();
+            broken[at] = if next() % 2 == 0 {
+                next() as u8
+            } else {
+                b'0' + (next() % 75) as u8
+            };
+        }
+        read(&broken);
+    }
+}

@@ -20,9 +20,9 @@ pub enum CrashImage {
     Torn(u64),
 }
 
-/// Files and folders with a live and a durable state. Power is lost at a chosen event: every operation fails from then on,
-/// and [`Self::after_crash`] shows what is left. An event is the moment before and the moment after each sync, and the moment
-/// before each rename.
+/// Files and folders with a live and a durable state. Power is lost at a chosen event: every operation fails from then
+/// on, and [`Self::after_crash`] shows what is left. An event is the moment before and the moment after each sync, and
+/// the moment before each rename.
 #[derive(Clone)]
 pub struct CrashVolume(Arc<Mutex<Disk>>);
 

@@ -1,5 +1,5 @@
-//! Power is lost at every event of a publish, with everything unsynced dropped or torn: the name then stands for the old
-//! scene, the new one, or nothing where nothing was, and a file that opens is whole.
+//! Power is lost at every event of a publish, with everything unsynced dropped or torn: the name then stands for the
+//! old scene, the new one, or nothing where nothing was, and a file that opens is whole.
 
 use crate::support::{names, write};
 use pbgi_store::testsuite::{CrashImage, CrashVolume};

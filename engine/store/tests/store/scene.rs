@@ -135,6 +135,29 @@ fn damage_is_reported_with_file_page_and_remedy() {
 }
 
 #[test]
+fn a_file_cut_or_edited_while_it_is_open_is_an_error_of_the_page() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = scene_in(dir.path(), 100, 1);
+    let scene = Scene::open(&path).unwrap();
+    let mut page = vec![0; scene.info().page_bytes(PageKind::Point)];
+    let file = fs::OpenOptions::new()
+        .write(true)
+        .open(path.join("points.pages"))
+        .unwrap();
+    std::os::unix::fs::FileExt::write_all_at(&file, &[9], 4096 + 7).unwrap();
+    file.set_len(4096 + 2 * 1024 + 10).unwrap();
+    for (number, damaged) in [(0, true), (1, false), (2, true), (3, true)] {
+        match scene.read_page(PageKind::Point, PageNo(number), &mut page) {
+            Ok(()) => assert!(!damaged, "page {number}"),
+            Err(error) => {
+                assert!(damaged && matches!(error, StoreError::Corrupt { .. }), "{error}");
+                assert!(error.to_string().contains(&format!("point page {number}")), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
 fn files_of_different_builds_do_not_mix() {
     let dir = tempfile::tempdir().unwrap();
     let path = scene_in(dir.path(), 100, 1);

@@ -1,0 +1,169 @@
+//! A real daemon in a folder of its own, ended and checked for leftovers when dropped.
+#![allow(dead_code, reason = "each test program uses a part")]
+
+use hyper_util::rt::TokioIo;
+use pbgi_proto::v1;
+use pbgi_proto::v1::daemon_service_client::DaemonServiceClient;
+use pbgi_proto::v1::job_service_client::JobServiceClient;
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+use tonic::transport::{Channel, Endpoint};
+
+pub(crate) const SERVER: &str = env!("CARGO_BIN_EXE_pbgi-server");
+
+pub(crate) struct Daemon {
+    pub(crate) child: Child,
+    pub(crate) folder: TempDir,
+}
+
+/// A worker that sleeps.
+pub(crate) fn sleeper(folder: &Path) -> PathBuf {
+    script(folder, "sleeper", "exec sleep 1000")
+}
+
+pub(crate) fn script(folder: &Path, name: &str, body: &str) -> PathBuf {
+    let path = folder.join(name);
+    std::fs::write(&path, format!("#!/bin/sh\n{body}\n")).unwrap();
+    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).unwrap();
+    path
+}
+
+pub(crate) fn command(folder: &Path, worker: &Path) -> Command {
+    let mut command = Command::new(SERVER);
+    command
+        .args(["--memory", "256M", "--workers", "2", "--log", "pbgi_server=debug"])
+        .arg("--runtime-dir")
+        .arg(folder.join("run"))
+        .arg("--state-dir")
+        .arg(folder.join("state"))
+        .arg("--scratch-dir")
+        .arg(folder.join("scratch"))
+        .arg("--worker-binary")
+        .arg(worker)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    command
+}
+
+/// The first line on standard output.
+pub(crate) fn first_line(child: &mut Child) -> String {
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap())
+        .read_line(&mut line)
+        .unwrap();
+    line.trim().to_owned()
+}
+
+impl Daemon {
+    pub(crate) fn start(worker: impl FnOnce(&Path) -> PathBuf, change: impl FnOnce(&mut Command)) -> Self {
+        let folder = tempfile::Builder::new().prefix("pbgi").tempdir().unwrap();
+        let mut command = command(folder.path(), &worker(folder.path()));
+        let log = std::fs::File::create(folder.path().join("log")).unwrap();
+        command.stderr(log);
+        change(&mut command);
+        let mut child = command.spawn().unwrap();
+        let line = first_line(&mut child);
+        let daemon = Self { child, folder };
+        assert_eq!(line, "READY", "{}", daemon.log());
+        daemon
+    }
+
+    pub(crate) fn log(&self) -> String {
+        std::fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
+    }
+
+    pub(crate) fn segment(&self) -> PathBuf {
+        let name = std::fs::read_to_string(self.folder.path().join("state/segment")).unwrap();
+        Path::new("/dev/shm").join(name.trim().trim_start_matches('/'))
+    }
+
+    pub(crate) fn signal(&self, signal: &str) {
+        let pid = self.child.id().to_string();
+        assert!(Command::new("kill").args([signal, &pid]).status().unwrap().success());
+    }
+
+    pub(crate) fn wait(&mut self) -> ExitStatus {
+        let deadline = Instant::now() + Duration::from_secs(20);
+        loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status;
+            }
+            assert!(Instant::now() < deadline, "daemon does not end: {}", self.log());
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Ends the daemon and checks that nothing is left.
+    pub(crate) fn stop(mut self) {
+        let segment = self.segment();
+        assert!(segment.metadata().is_ok(), "{segment:?}");
+        let children = children(self.child.id());
+        self.signal("-TERM");
+        let status = self.wait();
+        assert!(status.success(), "{status}: {}", self.log());
+        assert!(segment.metadata().is_err(), "segment left");
+        for name in ["run/jobs.sock", "run/queue.sock", "state/segment"] {
+            assert!(self.folder.path().join(name).symlink_metadata().is_err(), "{name} left");
+        }
+        assert_eq!(
+            std::fs::read_dir(self.folder.path().join("scratch")).unwrap().count(),
+            0
+        );
+        for pid in children {
+            assert!(!Path::new("/proc").join(pid.to_string()).is_dir(), "child {pid} left");
+        }
+    }
+
+    pub(crate) async fn channel(&self, socket: &str) -> Channel {
+        let path = self.folder.path().join("run").join(socket);
+        let connector = tower::service_fn(move |_| {
+            let path = path.clone();
+            async move { tokio::net::UnixStream::connect(path).await.map(TokioIo::new) }
+        });
+        Endpoint::from_static("http://localhost")
+            .connect_with_connector(connector)
+            .await
+            .unwrap()
+    }
+
+    pub(crate) async fn jobs(&self) -> JobServiceClient<Channel> {
+        JobServiceClient::new(self.channel("jobs.sock").await)
+    }
+
+    pub(crate) async fn status(&self) -> v1::DaemonStatus {
+        let mut client = DaemonServiceClient::new(self.channel("jobs.sock").await);
+        client.get_status(v1::GetStatusRequest {}).await.unwrap().into_inner()
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        // Its children end with it; its segment is removed here if a test failed.
+        if self.child.try_wait().is_ok_and(|status| status.is_none()) {
+            let segment = self.segment();
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+            let _ = std::fs::remove_file(segment);
+        }
+    }
+}
+
+/// Process ids of a process's children.
+pub(crate) fn children(pid: u32) -> Vec<u32> {
+    let parent = |pid: u32| {
+        let mut stat = String::new();
+        std::fs::File::open(format!("/proc/{pid}/stat"))
+            .ok()?
+            .read_to_string(&mut stat)
+            .ok()?;
+        stat.rsplit(')').next()?.split_whitespace().nth(1)?.parse::<u32>().ok()
+    };
+    let entries = std::fs::read_dir("/proc").unwrap().flatten();
+    let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    pids.filter(|&child| parent(child) == Some(pid)).collect()
+}

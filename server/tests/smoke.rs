@@ -1,0 +1,97 @@
+//! The program itself: starts, refuses a second daemon, ends without a trace.
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+mod harness;
+
+use harness::{Daemon, children, command, first_line, sleeper};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+#[test]
+fn daemon_starts_and_ends_without_a_trace() {
+    let daemon = Daemon::start(sleeper, |_| {});
+    let deadline = Instant::now() + Duration::from_secs(10);
+    while children(daemon.child.id()).len() < 2 {
+        assert!(Instant::now() < deadline, "no two workers: {}", daemon.log());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    daemon.stop();
+}
+
+#[test]
+fn second_daemon_on_a_state_directory_is_refused_and_the_first_named() {
+    let daemon = Daemon::start(sleeper, |_| {});
+    let worker = daemon.folder.path().join("sleeper");
+    let mut second = command(daemon.folder.path(), &worker).spawn().unwrap();
+    let line = first_line(&mut second);
+    assert_eq!(second.wait().unwrap().code(), Some(2));
+    let holder = format!("already in use by pbgi-server with process id {}", daemon.child.id());
+    assert!(line.starts_with("ERROR ") && line.contains(&holder), "{line}");
+    daemon.stop();
+}
+
+#[test]
+fn memory_that_is_not_there_is_refused_with_both_numbers() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = command(folder.path(), &sleeper(folder.path()));
+    let mut child = command.args(["--memory", "100T"]).spawn().unwrap();
+    let line = first_line(&mut child);
+    assert_eq!(child.wait().unwrap().code(), Some(78));
+    assert!(
+        line.contains("bytes needed") && line.contains("bytes available"),
+        "{line}"
+    );
+}
+
+#[test]
+fn segment_and_sockets_of_a_killed_daemon_are_cleaned_up_by_the_next() {
+    let mut first = Daemon::start(sleeper, |_| {});
+    let stale = first.segment();
+    first.child.kill().unwrap();
+    first.child.wait().unwrap();
+    assert!(stale.metadata().is_ok(), "the kill left no segment to clean up");
+    let worker = first.folder.path().join("sleeper");
+    let mut child = command(first.folder.path(), &worker).spawn().unwrap();
+    assert_eq!(first_line(&mut child), "READY");
+    assert!(stale.metadata().is_err(), "stale segment left");
+    first.child = child;
+    first.stop();
+}
+
+#[test]
+fn second_signal_ends_at_once_and_still_cleans_up() {
+    let mut daemon = Daemon::start(sleeper, |_| {});
+    let segment = daemon.segment();
+    let begun = Instant::now();
+    daemon.signal("-TERM");
+    // It may have ended by then.
+    let pid = daemon.child.id().to_string();
+    let _ = Command::new("kill").args(["-TERM", &pid]).status();
+    daemon.wait();
+    assert!(begun.elapsed() < Duration::from_secs(10));
+    assert!(segment.metadata().is_err());
+}
+
+#[test]
+fn private_daemon_ends_when_idle() {
+    let mut daemon = Daemon::start(sleeper, |command| {
+        command.args(["--private", "--idle-seconds", "1"]);
+    });
+    let segment = daemon.segment();
+    assert!(daemon.wait().success());
+    assert!(segment.metadata().is_err());
+    let log = std::fs::read_to_string(daemon.folder.path().join("state/server.log")).unwrap();
+    assert!(log.contains("idle for long enough"), "{log}");
+}
+
+#[test]
+fn every_unusable_directory_is_named_on_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["run", "scratch"] {
+        std::fs::write(folder.path().join(name), "").unwrap();
+    }
+    let mut child = command(folder.path(), &sleeper(folder.path())).spawn().unwrap();
+    let line = first_line(&mut child);
+    assert_eq!(child.wait().unwrap().code(), Some(1));
+    assert_eq!(line.matches("cannot use directory").count(), 2, "{line}");
+}
