@@ -19,7 +19,7 @@ const FLAT_THICKNESS: f32 = 0.06;
 /// noise in small leaves makes the share uncertain by about as much as this is below 1.
 pub(crate) const SECTION_FILL: f32 = 0.7;
 /// Share of the accepted solid angle at which clusters without a plane are accepted: their silhouette is a guess.
-const ROUND_SHARE: f32 = 0.1;
+const ROUND_SHARE: f32 = 0.2;
 /// Cosine between normals from which a disc is taken for the receiver's own surface.
 const SAME_SURFACE: f32 = 0.7;
 /// How far from an arc through both a receiver and an element may stand, as a sine.

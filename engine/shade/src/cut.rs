@@ -6,6 +6,7 @@ use crate::frame::Frame;
 use crate::painter::Painter;
 use crate::raster::{Raster, RasterTables};
 use crate::shader::{Receiver, ShadeCounters, ShadeError};
+use crate::simd::Simd;
 use crate::source::{SceneSource, SourceError};
 use glam::Vec3;
 use pbgi_core::limits::{CUT_NODES_MAX, MORTON_BITS};
@@ -19,6 +20,7 @@ pub(crate) struct Walk<'a> {
     pub(crate) info: &'a SceneInfo,
     pub(crate) settings: &'a ShadeSettings,
     pub(crate) tables: &'a RasterTables,
+    pub(crate) simd: Simd,
 }
 
 /// A voxel to visit; positions relative to the receiver.
@@ -51,7 +53,6 @@ pub(crate) struct Seen {
 }
 
 /// Walks the octree for one receiver and fills its raster.
-#[inline(always)]
 pub(crate) fn gather<S: SceneSource>(
     walk: &Walk<'_>,
     receiver: &Receiver,

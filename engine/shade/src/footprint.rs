@@ -152,50 +152,43 @@ impl Footprint {
         self.add_half_space(cut * plane.distance - normal * distance);
     }
 
-    /// A square that hides a sphere; `center` relative to the receiver, farther than `radius`.
-    #[inline(always)]
-    pub(crate) fn around_sphere(frame: &Frame, center: Vec3, radius: f32) -> Self {
-        let distance = center.length();
-        let direction = frame.local_from_world(center) / distance;
-        let half = radius * distance / (distance * distance - radius * radius).max(1e-30).sqrt();
-        let (u, v) = direction.any_orthonormal_pair();
-        let mut footprint = Self::rectangle(direction * distance, direction, distance, [(u, half), (v, half)]);
-        footprint.radius = half * std::f32::consts::SQRT_2;
-        footprint
-    }
-
     /// Blocks of rows that the footprint may touch.
     #[inline(always)]
     pub(crate) fn rows(&self, resolution: usize) -> std::ops::Range<usize> {
-        let blocks = resolution / LANES;
-        let (y, z) = (self.center.y, self.center.z);
-        let across = (y * y + z * z).sqrt();
-        if across <= self.radius {
-            return 0..blocks;
-        }
-        let (sin, cos) = (y / across, z / across);
-        let delta_sin = self.radius / across;
-        let delta_cos = (1.0 - delta_sin * delta_sin).sqrt();
-        // Row angles phi - delta and phi + delta; those with a negative cosine are below the horizon.
-        let low_above = cos * delta_cos + sin * delta_sin > 0.0;
-        let high_above = cos * delta_cos - sin * delta_sin > 0.0;
-        if !low_above && !high_above && cos <= 0.0 {
-            return 0..0;
-        }
-        let low = if low_above {
-            sin * delta_cos - cos * delta_sin
-        } else {
-            -1.0
-        };
-        let high = if high_above {
-            sin * delta_cos + cos * delta_sin
-        } else {
-            1.0
-        };
-        let block_of = |sin: f32| (sin + 1.0) * 0.5 * blocks as f32;
-        // The rows' middles lie half a row inside; the slack covers rounding.
-        let first = (block_of(low) - 1e-3).max(0.0) as usize;
-        let end = (block_of(high) + 1e-3).ceil().clamp(0.0, blocks as f32) as usize;
-        first..end.max(first)
+        row_blocks(self.center, self.radius, resolution)
     }
+}
+
+/// Blocks of rows that a sphere may touch; its centre in the receiver's frame.
+#[inline(always)]
+pub(crate) fn row_blocks(center: Vec3, radius: f32, resolution: usize) -> std::ops::Range<usize> {
+    let blocks = resolution / LANES;
+    let across = (center.y * center.y + center.z * center.z).sqrt();
+    if across <= radius {
+        return 0..blocks;
+    }
+    let (sin, cos) = (center.y / across, center.z / across);
+    let delta_sin = radius / across;
+    let delta_cos = (1.0 - delta_sin * delta_sin).sqrt();
+    // Row angles phi - delta and phi + delta; those with a negative cosine are below the horizon.
+    let low_above = cos * delta_cos + sin * delta_sin > 0.0;
+    let high_above = cos * delta_cos - sin * delta_sin > 0.0;
+    if !low_above && !high_above && cos <= 0.0 {
+        return 0..0;
+    }
+    let low = if low_above {
+        sin * delta_cos - cos * delta_sin
+    } else {
+        -1.0
+    };
+    let high = if high_above {
+        sin * delta_cos + cos * delta_sin
+    } else {
+        1.0
+    };
+    let block_of = |sin: f32| (sin + 1.0) * 0.5 * blocks as f32;
+    // The rows' middles lie half a row inside; the slack covers rounding.
+    let first = (block_of(low) - 1e-3).max(0.0) as usize;
+    let end = (block_of(high) + 1e-3).ceil().clamp(0.0, blocks as f32) as usize;
+    first..end.max(first)
 }

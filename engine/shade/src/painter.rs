@@ -5,7 +5,7 @@ use crate::cut::{Seen, Visit, Walk};
 use crate::facet::{Facet, facets};
 use crate::footprint::{Footprint, Plane};
 use crate::frame::Frame;
-use crate::raster::Raster;
+use crate::raster::{Ink, Raster};
 use crate::shader::Receiver;
 use glam::Vec3;
 use pbgi_core::PointRecord;
@@ -50,11 +50,9 @@ impl Painter<'_> {
             return true;
         }
         let far = visit.center.length_squared() > 1.1 * reach * reach;
+        let local = self.frame.local_from_world(visit.center);
         far && self.raster.covered_count() as f32 > HIDDEN_TEST_SHARE * bits as f32
-            && self.raster.hides(
-                self.walk.tables,
-                &Footprint::around_sphere(self.frame, visit.center, reach),
-            )
+            && self.walk.simd.hides_sphere(self.raster, self.walk.tables, local, reach)
     }
 
     #[inline(always)]
@@ -70,7 +68,7 @@ impl Painter<'_> {
     }
 
     /// A piece of a plane: the section of its voxel if it fills that, else the rectangle of its covariance.
-    #[inline(always)]
+    #[inline(never)]
     fn draw_flat(&mut self, cluster: &Cluster, visit: &Visit) {
         let plane = Plane::through(cluster.centroid, cluster.axis, TOUCH * visit.half);
         let toward = cluster.axis.dot(cluster.centroid) < 0.0;
@@ -117,7 +115,7 @@ impl Painter<'_> {
     }
 
     /// A cluster without a plane: the rectangle of its covariance seen from the receiver, as wide as its projected area.
-    #[inline(always)]
+    #[inline(never)]
     fn draw_round(&mut self, cluster: &Cluster, visit: &Visit) {
         let distance = cluster.distance_squared.sqrt();
         if distance < 1e-6 * visit.half {
@@ -153,7 +151,7 @@ impl Painter<'_> {
     }
 
     /// A leaf that is opened: the planes its points lie on, or else their discs. Points come nearest first.
-    #[inline(always)]
+    #[inline(never)]
     pub(crate) fn draw_leaf(&mut self, points: &[(f32, PointRecord)], visit: &Visit, receiver: &Receiver) {
         let Some((facets, len)) = facets(points, receiver.position) else {
             for (_, point) in points {
@@ -215,7 +213,16 @@ impl Painter<'_> {
         }
         let footprint = Footprint::disc(self.frame, center, plane, point.radius * DISC_SCALE);
         let weight = self.weight(distance, point.radius);
-        let count = self.raster.cover(self.walk.tables, &footprint, 1.0, weight, 0);
+        let count = self.walk.simd.cover(
+            self.raster,
+            self.walk.tables,
+            &footprint,
+            Ink {
+                density: 1.0,
+                weight,
+                seed: 0,
+            },
+        );
         if count > 0 {
             let sides = point.sides();
             let radiance = if normal.dot(center) < 0.0 {
@@ -231,9 +238,12 @@ impl Painter<'_> {
     #[inline(always)]
     fn cover(&mut self, footprint: &Footprint, density: f32, distance: f32, visit: &Visit) -> u32 {
         let weight = self.weight(distance, visit.half);
-        let count = self
-            .raster
-            .cover(self.walk.tables, footprint, density, weight, visit.path);
+        let ink = Ink {
+            density,
+            weight,
+            seed: visit.path,
+        };
+        let count = self.walk.simd.cover(self.raster, self.walk.tables, footprint, ink);
         self.seen.occlusion += weight * count as f32;
         count
     }

@@ -6,9 +6,11 @@
 //! hemisphere into cells of equal weight: irradiance and occlusion are bit counts. A convex cone meets a row in one
 //! interval of `tan a`, found from its bounding half-spaces by one division each.
 
-use crate::footprint::Footprint;
+use crate::footprint::{Footprint, row_blocks};
 use std::f32::consts::{FRAC_1_PI, PI};
 
+/// Tangents beyond this are the poles.
+const FAR: f32 = 1e6;
 /// Rows handled together, one vector register of floats.
 pub(crate) const LANES: usize = 8;
 /// Largest number of rows and of columns: one machine word a row.
@@ -83,6 +85,17 @@ fn column_angle(middle: f64) -> f64 {
     (low + high) / 2.0
 }
 
+/// How a footprint is drawn. What is left out follows a pattern that depends on `seed` alone.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Ink {
+    /// Share of the footprint that is covered.
+    pub(crate) density: f32,
+    /// Share of the newly covered bits that count as occluded.
+    pub(crate) weight: f32,
+    /// Names the element.
+    pub(crate) seed: u64,
+}
+
 impl Raster {
     pub(crate) fn new() -> Self {
         Self {
@@ -102,17 +115,10 @@ impl Raster {
         self.covered_count
     }
 
-    /// Covers a footprint's bits and counts those that were open. `density` below 1 leaves that share of the footprint open,
-    /// `weight` is the share of the new bits that count as occluded; both by a pattern that depends on `seed` alone.
+    /// Covers a footprint's bits and counts those that were open.
     #[inline(always)]
-    pub(crate) fn cover(
-        &mut self,
-        tables: &RasterTables,
-        footprint: &Footprint,
-        density: f32,
-        weight: f32,
-        seed: u64,
-    ) -> u32 {
+    pub(crate) fn cover(&mut self, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> u32 {
+        let Ink { density, weight, seed } = ink;
         let mut count = 0;
         let blocks = footprint.rows(tables.resolution);
         for block in blocks {
@@ -136,11 +142,11 @@ impl Raster {
         count
     }
 
-    /// Whether every bit of a footprint is covered already.
+    /// Whether every bit in which a sphere shows is covered already; `center` in the receiver's frame, farther than `radius`.
     #[inline(always)]
-    pub(crate) fn hides(&self, tables: &RasterTables, footprint: &Footprint) -> bool {
-        for block in footprint.rows(tables.resolution) {
-            let masks = footprint_masks(tables, footprint, block);
+    pub(crate) fn hides_sphere(&self, tables: &RasterTables, center: glam::Vec3, radius: f32) -> bool {
+        for block in row_blocks(center, radius, tables.resolution) {
+            let masks = sphere_masks(tables, center, radius, block);
             let open = masks
                 .into_iter()
                 .zip(&self.covered[block * LANES..])
@@ -186,8 +192,6 @@ impl Raster {
 /// Bits of eight rows that lie inside a footprint.
 #[inline(always)]
 fn footprint_masks(tables: &RasterTables, footprint: &Footprint, block: usize) -> [u64; LANES] {
-    /// Tangents beyond this are the poles.
-    const FAR: f32 = 1e6;
     let start = block * LANES;
     let (mut low, mut high) = ([-FAR; LANES], [FAR; LANES]);
     for plane in footprint.half_spaces() {
@@ -216,35 +220,94 @@ fn footprint_masks(tables: &RasterTables, footprint: &Footprint, block: usize) -
     let (first, end) = (columns(&low, tables.resolution), columns(&high, tables.resolution));
     let mut masks = [0; LANES];
     for lane in 0..LANES {
-        let length = end[lane].saturating_sub(first[lane]);
-        // `length` is at most 64; a shift by 64 is out of range, hence two shifts.
-        let run = if length == 0 { 0 } else { u64::MAX >> (64 - length) };
-        masks[lane] = if first[lane] < 64 { run << first[lane] } else { 0 };
+        masks[lane] = run_mask(first[lane], end[lane]);
     }
     masks
 }
 
-/// Number of column middles below each tangent: `resolution (a + sin a cos a) / pi`, rounded. The arcsine is the
-/// polynomial 4.4.45 of Abramowitz and Stegun, whose error (7e-5) is a thousandth of a column.
+/// Bits from `first` up to, not including, `end`; both at most 64.
+#[inline(always)]
+fn run_mask(first: u32, end: u32) -> u64 {
+    // A shift by 64 is out of range, hence the halves.
+    let below = |column: u32| ((1u64 << (column / 2)) << (column - column / 2)).wrapping_sub(1);
+    below(end) & !below(first)
+}
+
+/// Number of column middles below each tangent.
 #[inline(always)]
 fn columns(tangent: &[f32; LANES], resolution: usize) -> [u32; LANES] {
+    let mut result = [0; LANES];
+    for lane in 0..LANES {
+        let tangent = tangent[lane].clamp(-FAR, FAR);
+        let cos = 1.0 / (1.0 + tangent * tangent).sqrt();
+        result[lane] = column(tangent * cos, cos, resolution as f32);
+    }
+    result
+}
+
+/// Bits of eight rows in which a sphere shows. In a row's plane the sphere lies around the angle of its centre's projection
+/// `(x, p)`, at distance `q`; it spans the angles whose cosine with that is `m / q`, `m` being the length of the tangents.
+#[inline(always)]
+fn sphere_masks(tables: &RasterTables, center: glam::Vec3, radius: f32, block: usize) -> [u64; LANES] {
+    let start = block * LANES;
+    let resolution = tables.resolution as f32;
+    let tangent_squared = center.length_squared() - radius * radius;
+    let tangent = tangent_squared.max(0.0).sqrt();
+    let x = center.x;
+    let (mut low, mut low_cos, mut high, mut high_cos, mut seen) =
+        ([0.0; LANES], [0.0; LANES], [0.0; LANES], [0.0; LANES], [0u32; LANES]);
+    for lane in 0..LANES {
+        let p = center.y * tables.row_sin[start + lane] + center.z * tables.row_cos[start + lane];
+        let q_squared = x * x + p * p;
+        let reach_squared = q_squared - tangent_squared;
+        let reach = reach_squared.max(0.0).sqrt();
+        let inverse = 1.0 / q_squared;
+        low_cos[lane] = (p * tangent + x * reach) * inverse;
+        high_cos[lane] = (p * tangent - x * reach) * inverse;
+        low[lane] = (x * tangent - p * reach) * inverse;
+        high[lane] = (x * tangent + p * reach) * inverse;
+        // Signs as masks: a branch would keep the loop from becoming one of vectors.
+        seen[lane] = !sign_mask(reach_squared) & !(sign_mask(low_cos[lane]) & sign_mask(high_cos[lane]) & sign_mask(p));
+    }
+    let (mut first, mut end) = ([0; LANES], [0; LANES]);
+    for lane in 0..LANES {
+        let low = select(sign_mask(low_cos[lane]), -1.0, low[lane]);
+        let high = select(sign_mask(high_cos[lane]), 1.0, high[lane]);
+        first[lane] = column(low, low_cos[lane], resolution);
+        end[lane] = column(high, high_cos[lane], resolution) & seen[lane];
+    }
+    let mut masks = [0; LANES];
+    for lane in 0..LANES {
+        masks[lane] = run_mask(first[lane], end[lane]);
+    }
+    masks
+}
+
+/// All ones for a negative number.
+#[inline(always)]
+fn sign_mask(value: f32) -> u32 {
+    ((value.to_bits() as i32) >> 31) as u32
+}
+
+#[inline(always)]
+fn select(mask: u32, set: f32, clear: f32) -> f32 {
+    f32::from_bits((set.to_bits() & mask) | (clear.to_bits() & !mask))
+}
+
+/// Number of column middles below an angle: `resolution (a + sin a cos a) / pi`, rounded. The arcsine is the polynomial
+/// 4.4.45 of Abramowitz and Stegun, whose error (7e-5) is a thousandth of a column.
+#[inline(always)]
+fn column(sin: f32, cos: f32, resolution: f32) -> u32 {
     /// 2^23: floats from here on are integers.
     const INTEGER_SHIFT: f32 = 8_388_608.0;
     const COLUMN_MASK: u32 = 0x7f;
-    let resolution = resolution as f32;
-    let mut result = [0; LANES];
-    for lane in 0..LANES {
-        let u = tangent[lane].clamp(-1e6, 1e6);
-        let cos = 1.0 / (1.0 + u * u).sqrt();
-        let sin = (u * cos).abs().min(1.0);
-        let polynomial = 1.570_728_8 + sin * (-0.212_114_4 + sin * (0.074_261 - sin * 0.018_729_3));
-        let arcsine = PI / 2.0 - (1.0 - sin).sqrt() * polynomial;
-        let half_share = (arcsine + sin * cos) * FRAC_1_PI;
-        let share = 0.5 + half_share.copysign(u);
-        // The sum's last bits are the rounded integer; a cast would check for what cannot be.
-        result[lane] = (share * resolution + INTEGER_SHIFT).to_bits() & COLUMN_MASK;
-    }
-    result
+    let s = sin.abs().min(1.0);
+    let polynomial = 1.570_728_8 + s * (-0.212_114_4 + s * (0.074_261 - s * 0.018_729_3));
+    let arcsine = PI / 2.0 - (1.0 - s).sqrt() * polynomial;
+    let half_share = (arcsine + s * cos.max(0.0)) * FRAC_1_PI;
+    let share = 0.5 + half_share.copysign(sin);
+    // The sum's last bits are the rounded integer; a cast would check for what cannot be.
+    (share * resolution + INTEGER_SHIFT).to_bits() & COLUMN_MASK
 }
 
 /// A word whose bits are set with probability `density` (in steps of 1/16), always the same for a seed.
@@ -282,6 +345,12 @@ mod tests {
     use crate::footprint::Footprint;
     use glam::Vec3;
 
+    const SOLID: Ink = Ink {
+        density: 1.0,
+        weight: 1.0,
+        seed: 1,
+    };
+
     /// Form factors of parallel squares above the receiver, from tables of heat transfer.
     #[test]
     fn a_coaxial_square_covers_its_form_factor() {
@@ -291,7 +360,7 @@ mod tests {
             let turned = |x, y| (Vec3::new(x, y, 0.0), half);
             let sides = [turned(0.893_96, 0.448_14), turned(-0.448_14, 0.893_96)];
             let square = Footprint::rectangle(Vec3::Z, Vec3::Z, 1.0, sides);
-            let count = raster.cover(&tables, &square, 1.0, 1.0, 1);
+            let count = raster.cover(&tables, &square, SOLID);
             // Form factor of a parallel square from a point below its centre: four times that of a quarter.
             let x = half / (1.0 + half * half).sqrt();
             let quarter = x * (half / (1.0 + half * half).sqrt()).atan() / PI;
@@ -331,9 +400,10 @@ mod tests {
         let tables = RasterTables::new(32);
         let mut raster = Raster::new();
         let square = Footprint::rectangle(Vec3::new(0.3, 0.2, 1.0), Vec3::Z, 1.0, [(Vec3::X, 0.4), (Vec3::Y, 0.4)]);
-        assert!(!raster.hides(&tables, &square));
-        assert!(raster.cover(&tables, &square, 1.0, 1.0, 1) > 0);
-        assert_eq!(raster.cover(&tables, &square, 1.0, 1.0, 1), 0);
-        assert!(raster.hides(&tables, &square));
+        assert!(!raster.hides_sphere(&tables, Vec3::new(0.3, 0.2, 1.0), 0.2));
+        assert!(raster.cover(&tables, &square, SOLID) > 0);
+        assert_eq!(raster.cover(&tables, &square, SOLID), 0);
+        assert!(raster.hides_sphere(&tables, Vec3::new(0.3, 0.2, 1.0), 0.2));
+        assert!(!raster.hides_sphere(&tables, Vec3::new(0.3, 0.2, 1.0), 0.7));
     }
 }

@@ -1,6 +1,6 @@
 //! Receivers in, irradiance and occlusion out.
 
-use crate::cut::{Scratch, Walk};
+use crate::cut::{Scratch, Walk, gather};
 use crate::environment::ProbeMap;
 use crate::frame::Frame;
 use crate::raster::{Raster, RasterTables};
@@ -156,11 +156,10 @@ impl Shader {
             info: &self.info,
             settings: &self.settings,
             tables: &self.tables,
+            simd: self.simd,
         };
         let (raster, scratch, counters) = (&mut self.raster, &mut self.scratch, &mut self.counters);
-        let seen = self
-            .simd
-            .gather(&walk, &receiver, &frame, source, raster, scratch, counters)?;
+        let seen = gather(&walk, &receiver, &frame, source, raster, scratch, counters)?;
         self.counters.receivers += 1;
         let mut radiance = seen.radiance;
         if let Some(probe) = &self.probe {

@@ -1,15 +1,14 @@
-//! The one place that names instruction sets: the same code compiled for AVX2 and for any processor, chosen at run time.
+//! The one place that names instruction sets: the raster's kernels compiled for AVX2 and for any processor, chosen at run
+//! time.
 
 #![allow(
     unsafe_code,
     reason = "calling a function compiled for more than the build's baseline needs `unsafe`"
 )]
 
-use crate::cut::{Scratch, Seen, Walk, gather};
-use crate::frame::Frame;
-use crate::raster::Raster;
-use crate::shader::{Receiver, ShadeCounters, ShadeError};
-use crate::source::SceneSource;
+use crate::footprint::Footprint;
+use crate::raster::{Ink, Raster, RasterTables};
+use glam::Vec3;
 
 /// Instruction set of the kernels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,7 +26,6 @@ impl Simd {
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2")
             && is_x86_feature_detected!("fma")
-            && is_x86_feature_detected!("f16c")
             && is_x86_feature_detected!("bmi1")
             && is_x86_feature_detected!("bmi2")
             && is_x86_feature_detected!("lzcnt")
@@ -38,37 +36,35 @@ impl Simd {
         Self::Scalar
     }
 
-    /// [`gather`] with this instruction set. Both ways compute the same bits: no operation is contracted or reordered.
-    #[expect(clippy::too_many_arguments, reason = "the twin of `gather`")]
-    pub(crate) fn gather<S: SceneSource>(
-        self,
-        walk: &Walk<'_>,
-        receiver: &Receiver,
-        frame: &Frame,
-        source: &mut S,
-        raster: &mut Raster,
-        scratch: &mut Scratch,
-        counters: &mut ShadeCounters,
-    ) -> Result<Seen, ShadeError> {
+    /// [`Raster::cover`]. Both ways compute the same bits: no operation is contracted or reordered.
+    pub(crate) fn cover(self, raster: &mut Raster, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> u32 {
         match self {
             #[cfg(target_arch = "x86_64")]
             // SAFETY: `Avx2` is only made by `detect`, after every feature that the function is compiled for was found.
-            Self::Avx2 => unsafe { gather_avx2(walk, receiver, frame, source, raster, scratch, counters) },
-            Self::Scalar => gather(walk, receiver, frame, source, raster, scratch, counters),
+            Self::Avx2 => unsafe { cover_avx2(raster, tables, footprint, ink) },
+            Self::Scalar => raster.cover(tables, footprint, ink),
+        }
+    }
+
+    /// [`Raster::hides_sphere`].
+    pub(crate) fn hides_sphere(self, raster: &Raster, tables: &RasterTables, center: Vec3, radius: f32) -> bool {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: as in `cover`.
+            Self::Avx2 => unsafe { hides_sphere_avx2(raster, tables, center, radius) },
+            Self::Scalar => raster.hides_sphere(tables, center, radius),
         }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,lzcnt,popcnt")]
-fn gather_avx2<S: SceneSource>(
-    walk: &Walk<'_>,
-    receiver: &Receiver,
-    frame: &Frame,
-    source: &mut S,
-    raster: &mut Raster,
-    scratch: &mut Scratch,
-    counters: &mut ShadeCounters,
-) -> Result<Seen, ShadeError> {
-    gather(walk, receiver, frame, source, raster, scratch, counters)
+#[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
+fn cover_avx2(raster: &mut Raster, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> u32 {
+    raster.cover(tables, footprint, ink)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
+fn hides_sphere_avx2(raster: &Raster, tables: &RasterTables, center: Vec3, radius: f32) -> bool {
+    raster.hides_sphere(tables, center, radius)
 }
