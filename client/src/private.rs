@@ -4,28 +4,24 @@
 //! user's folders and what a daemon is keyed by: the program's build, its memory and its number of workers. State and log lie under
 //! `XDG_STATE_HOME/pbgi`, scratch under `XDG_CACHE_HOME/pbgi`. Other folders therefore mean another daemon.
 
+mod seat;
+
 use crate::client::Client;
 use crate::error::ClientError;
-use nix::fcntl::{Flock, FlockArg};
+use seat::Seat;
 use std::ffi::OsString;
-use std::fs::{self, DirBuilder, File, OpenOptions};
-use std::io::{BufRead, BufReader, Read};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::fs;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Longest path that fits a socket address, with its terminating zero left out.
 const SOCKET_PATH_MAX: usize = 107;
-/// Until a daemon that starts says READY: it reserves its memory first.
-const START_TIMEOUT: Duration = Duration::from_secs(60);
-/// Between two looks at a lock that another client holds.
-const LOCK_POLL: Duration = Duration::from_millis(50);
-/// A daemon that is going away holds its folders for a moment.
+/// A daemon that is going away holds its folders until what is leased is finished, for half a minute at most.
+const LEAVE_TIMEOUT: Duration = Duration::from_secs(40);
 const RETRY_WAIT: Duration = Duration::from_millis(300);
-const ATTEMPTS: u32 = 5;
-/// Bytes of a daemon's last words that an error shows.
-const LAST_WORDS_MAX: usize = 2000;
+/// What a daemon says whose state folder is held.
+const IN_USE: &str = "already in use";
 
 /// Where a user's daemons live.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -145,7 +141,8 @@ impl Folders {
             return Ok(client);
         }
         let _lock = seat.lock().await?;
-        let mut attempt = 1;
+        let deadline = Instant::now() + LEAVE_TIMEOUT;
+        let mut waited = false;
         loop {
             // Another client may have started it while we waited.
             if let Ok(client) = Client::connect_path(&seat.socket()).await {
@@ -159,8 +156,12 @@ impl Folders {
                     ));
                     return Ok(client);
                 }
-                Err(ClientError::Start(_)) if attempt < ATTEMPTS && seat.is_leaving() => {
-                    attempt += 1;
+                // Its predecessor has closed the sockets but not left the folder yet.
+                Err(ClientError::Start(text)) if text.contains(IN_USE) && Instant::now() < deadline => {
+                    if !waited {
+                        say("waiting for the last daemon to leave");
+                    }
+                    waited = true;
                     tokio::time::sleep(RETRY_WAIT).await;
                 }
                 Err(error) => return Err(error),
@@ -181,156 +182,6 @@ pub fn server_program(own: &Path) -> Result<PathBuf, ClientError> {
             "there is no {program:?}; install pbgi-server beside pbgi-client, or name a running daemon with --server"
         ))),
     }
-}
-
-/// One daemon's folders and how it is started.
-struct Seat<'a> {
-    runtime: PathBuf,
-    state: PathBuf,
-    scratch: PathBuf,
-    program: &'a Path,
-    options: &'a PrivateOptions,
-}
-
-impl<'a> Seat<'a> {
-    fn new(folders: &Folders, name: &str, program: &'a Path, options: &'a PrivateOptions) -> Result<Self, ClientError> {
-        let seat = Self {
-            runtime: folders.runtime.join(name),
-            state: folders.state.join(name),
-            scratch: folders.cache.join("scratch").join(name),
-            program,
-            options,
-        };
-        make_private(&folders.runtime)?;
-        for folder in [&seat.runtime, &seat.state, &seat.scratch] {
-            make_private(folder)?;
-        }
-        Ok(seat)
-    }
-
-    fn socket(&self) -> PathBuf {
-        self.runtime.join("jobs.sock")
-    }
-
-    fn log(&self) -> PathBuf {
-        self.state.join("start.log")
-    }
-
-    /// Keeps other clients from starting the same daemon.
-    async fn lock(&self) -> Result<Flock<File>, ClientError> {
-        let path = self.runtime.join("start.lock");
-        let failed = |source: std::io::Error| ClientError::Io {
-            action: "lock",
-            path: path.clone(),
-            source,
-        };
-        let open = OpenOptions::new().create(true).append(true).mode(0o600).open(&path);
-        let mut file = open.map_err(failed)?;
-        let deadline = Instant::now() + 2 * START_TIMEOUT;
-        loop {
-            match Flock::lock(file, FlockArg::LockExclusiveNonblock) {
-                Ok(lock) => return Ok(lock),
-                Err((back, nix::errno::Errno::EWOULDBLOCK)) if Instant::now() < deadline => file = back,
-                Err((_, errno)) => return Err(failed(errno.into())),
-            }
-            tokio::time::sleep(LOCK_POLL).await;
-        }
-    }
-
-    /// Whether a daemon whose socket is closed still holds the state folder.
-    fn is_leaving(&self) -> bool {
-        let words = last_words(&self.log());
-        words.contains("another daemon") || words.contains("already")
-    }
-
-    /// Starts the daemon and waits until it is ready; returns its process id.
-    async fn start(&self) -> Result<u32, ClientError> {
-        let mut child = self.spawn()?;
-        let stdout = child.stdout.take();
-        let (sender, answer) = tokio::sync::oneshot::channel();
-        std::thread::spawn(move || {
-            // Nobody waits any more if the client gave up.
-            let _ = sender.send(first_line(stdout));
-        });
-        let line = match tokio::time::timeout(START_TIMEOUT, answer).await {
-            Ok(line) => line.unwrap_or_default(),
-            Err(_) => {
-                let _ = child.kill();
-                let _ = child.wait();
-                return Err(ClientError::Start(format!(
-                    "{:?} was not ready within {} s; see {:?}",
-                    self.program,
-                    START_TIMEOUT.as_secs(),
-                    self.log()
-                )));
-            }
-        };
-        if line == "READY" {
-            return Ok(child.id());
-        }
-        let _ = child.wait();
-        Err(ClientError::Start(match line.strip_prefix("ERROR ") {
-            Some(text) => text.to_owned(),
-            None => {
-                let words = last_words(&self.log());
-                let words = if words.is_empty() { "it said nothing" } else { &words };
-                format!("{:?} stopped while starting: {words}", self.program)
-            }
-        }))
-    }
-
-    fn spawn(&self) -> Result<Child, ClientError> {
-        let log = OpenOptions::new()
-            .create(true)
-            .write(true)
-            .truncate(true)
-            .mode(0o600)
-            .open(self.log());
-        let log = log.map_err(|source| ClientError::Io {
-            action: "write",
-            path: self.log(),
-            source,
-        })?;
-        let mut command = Command::new(self.program);
-        command.arg("--private");
-        command.arg("--runtime-dir").arg(&self.runtime);
-        command.arg("--state-dir").arg(&self.state);
-        command.arg("--scratch-dir").arg(&self.scratch);
-        if let Some(bytes) = self.options.memory_bytes {
-            command.arg("--memory").arg(bytes.to_string());
-        }
-        if let Some(workers) = self.options.workers {
-            command.arg("--workers").arg(workers.to_string());
-        }
-        // It outlives this command: it must hold neither the terminal nor a pipe of ours, nor the folder we stand in.
-        command
-            .current_dir("/")
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(log);
-        command.spawn().map_err(|source| ClientError::Io {
-            action: "run",
-            path: self.program.to_owned(),
-            source,
-        })
-    }
-}
-
-fn first_line(stdout: Option<ChildStdout>) -> String {
-    /// Enough for any error text.
-    const LINE_MAX: u64 = 16 << 10;
-    let mut line = String::new();
-    if let Some(stdout) = stdout {
-        // A daemon that dies closes the pipe: the line stays empty, and its log tells why.
-        let _ = BufReader::new(stdout.take(LINE_MAX)).read_line(&mut line);
-    }
-    line.trim_end().to_owned()
-}
-
-fn last_words(log: &Path) -> String {
-    let bytes = fs::read(log).unwrap_or_default();
-    let tail = &bytes[bytes.len().saturating_sub(LAST_WORDS_MAX)..];
-    String::from_utf8_lossy(tail).trim().to_owned()
 }
 
 /// What tells this program's daemons from those of another build or with other limits.
@@ -377,30 +228,9 @@ fn fits_a_socket(runtime: &Path) -> bool {
     runtime.as_os_str().len() + socket_tail_len() <= SOCKET_PATH_MAX
 }
 
-/// Makes a folder that only we can use, and makes sure that it is one.
-fn make_private(folder: &Path) -> Result<(), ClientError> {
-    let failed = |source| ClientError::Io {
-        action: "make folder",
-        path: folder.to_owned(),
-        source,
-    };
-    DirBuilder::new()
-        .recursive(true)
-        .mode(0o700)
-        .create(folder)
-        .map_err(failed)?;
-    let metadata = fs::symlink_metadata(folder).map_err(failed)?;
-    let ours = metadata.is_dir() && metadata.uid() == nix::unistd::getuid().as_raw();
-    if ours && metadata.mode() & 0o022 == 0 {
-        return Ok(());
-    }
-    Err(ClientError::Start(format!(
-        "folder {folder:?} can be changed by others; remove it, or set PBGI_RUNTIME_DIR to a folder of your own"
-    )))
-}
-
 #[cfg(test)]
 mod tests {
+    use super::seat::make_private;
     use super::*;
     use std::os::unix::fs::PermissionsExt;
 

@@ -61,7 +61,7 @@ pub(crate) struct OutputArgs {
 #[derive(Args, Debug, Default)]
 pub(crate) struct StatsArgs {
     /// Write the statistics to this file as one JSON object
-    #[arg(long, value_name = "FILE.json")]
+    #[arg(long, value_name = "FILE.json", help_heading = "Statistics")]
     pub(crate) stats: Option<PathBuf>,
 }
 

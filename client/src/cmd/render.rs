@@ -57,7 +57,7 @@ pub(crate) struct DemoArgs {
     /// Replace an existing output
     #[arg(long)]
     overwrite: bool,
-    /// Pixels of the picture [default: 480x360]
+    /// Pixels of the picture [default: 400x300]
     #[arg(long, value_name = "WxH", value_parser = super::args::picture_size)]
     size: Option<Size>,
     #[command(flatten)]
@@ -72,8 +72,8 @@ pub(crate) struct DemoArgs {
 
 const DEMO_OUTPUT: &str = "demo.exr";
 const DEMO_SIZE: Size = Size {
-    width: 480,
-    height: 360,
+    width: 400,
+    height: 300,
 };
 /// Enough for a smooth picture of a small room.
 const DEMO_POINTS: u64 = 200_000;
