@@ -211,6 +211,16 @@ mod tests {
     }
 
     #[test]
+    fn default_budget_holds_a_picture_of_four_thousand_columns() {
+        let machine = Machine {
+            shared_free_bytes: 100 * G,
+            limit_bytes: None,
+        };
+        let plan = MemoryPlan::new(None, 8, &machine).unwrap();
+        assert!(plan.work_bytes >= 3840 * 2160 * limits::PICTURE_BYTES_PER_PIXEL);
+    }
+
+    #[test]
     fn parts_add_up_to_the_total() {
         let machine = Machine {
             shared_free_bytes: 100 * G,

@@ -1,7 +1,7 @@
 //! Where the scheduler meets the world: holds the jobs, carries out what the scheduler says, and answers workers and clients.
 //!
 //! Everything happens under one lock, briefly: what takes time is spawned. Entry points for workers are here, for clients in
-//! [`clients`], for the daemon's clock in [`upkeep`].
+//! `clients`, for the daemon's clock in `upkeep`.
 
 mod clients;
 mod upkeep;

@@ -75,15 +75,16 @@ pub const STDERR_TAIL_BYTES: usize = 4 << 10;
 pub const SPEC_BYTES_MAX: u64 = 16 << 20;
 
 /// Private memory set aside for the daemon itself.
-pub const DAEMON_RESERVE_BYTES: u64 = 24 << 20;
+pub const DAEMON_RESERVE_BYTES: u64 = 16 << 20;
 /// Private memory set aside for each worker: its code's data, one tile, its raster, an environment map.
-pub const WORKER_RESERVE_BYTES: u64 = 16 << 20;
-/// Share of the rest that is pages in the segment; what remains is for builds and pictures.
-pub const SEGMENT_SHARE: f64 = 0.55;
+pub const WORKER_RESERVE_BYTES: u64 = 8 << 20;
+/// Share of the rest that is pages in the segment; what remains is for builds and pictures. At half, the default budget holds
+/// a picture of 3840 x 2160.
+pub const SEGMENT_SHARE: f64 = 0.5;
 /// Memory that a build wants at least, where the budget has it: the least of pbgi-build, with room for its input.
 pub const BUILD_BYTES_MIN: u64 = 72 << 20;
-/// Bytes that one pixel of a picture takes while it is read, held and written.
-pub const PICTURE_BYTES_PER_PIXEL: u64 = 96;
+/// Bytes that one pixel of a picture takes at its peak, which is when it is written (113 measured at 1920 x 1080).
+pub const PICTURE_BYTES_PER_PIXEL: u64 = 116;
 /// Share of a machine's limit that is taken without being asked to, and the most of a container's limit.
 pub const LIMIT_SHARE: f64 = 0.8;
 

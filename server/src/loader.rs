@@ -31,7 +31,7 @@ impl Loader {
     /// Welcomes a worker and serves its page channel on a thread of its own.
     ///
     /// # Errors
-    /// No thread to be had, or the channel is broken already.
+    /// No thread to be had.
     pub fn serve(&self, birth: &WorkerBirth, socket: UnixStream) -> Result<(), ServerError> {
         let layout = self.cache.layout();
         let welcome = Welcome {
@@ -43,7 +43,12 @@ impl Loader {
             local_node_frames: layout.pool(PageKind::Node).local_frames,
             local_point_frames: layout.pool(PageKind::Point).local_frames,
         };
-        channel::send(&socket, &welcome)?;
+        if let Err(error) = channel::send(&socket, &welcome) {
+            // It is dead already: how it died says more than this error.
+            tracing::debug!(slot = birth.seat.slot, %error, "worker cannot be welcomed");
+            self.supervisor.hangup(birth.seat);
+            return Ok(());
+        }
         let loader = self.clone();
         let seat = birth.seat;
         std::thread::Builder::new()

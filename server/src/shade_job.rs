@@ -48,7 +48,7 @@ pub struct Counters {
     pub shared_hits: u64,
     /// Of these, pages that another job loaded.
     pub shared_hits_other_job: u64,
-    /// Pages that the daemon was asked for.
+    /// Pages that the daemon had to read.
     pub cache_misses: u64,
     /// Processor time, nanoseconds.
     pub cpu_nanos: u64,
@@ -188,10 +188,9 @@ fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds: f64) -> S
     let tiles = &shading.counters;
     let count = |value: u64| Some(value as f64);
     let ratio = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
-    // A worker's miss that the daemon answers without the disk was served by the shared cache after all.
+    // Loads are counted here, not by workers: one that dies takes its tile's counters with it, but the page was read.
     let misses = pages.loads;
-    let shared = tiles.shared_hits + pages.resident_hits;
-    let requests = tiles.local_hits + shared + misses;
+    let requests = tiles.local_hits + tiles.shared_hits + misses;
     Statistics {
         points: count(info.point_count),
         nodes: count(info.node_count),
@@ -210,8 +209,8 @@ fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds: f64) -> S
         pages_loaded: count(pages.loads),
         bytes_read: count(pages.bytes_loaded),
         local_hits: count(tiles.local_hits),
-        shared_hits: count(shared),
-        shared_hits_other_job: count(tiles.shared_hits_other_job + pages.hits_other_job),
+        shared_hits: count(tiles.shared_hits),
+        shared_hits_other_job: count(tiles.shared_hits_other_job),
         cache_misses: count(misses),
         holes: count(shading.frame.holes()),
         ..Statistics::default()

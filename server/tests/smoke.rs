@@ -6,6 +6,9 @@ mod harness;
 use harness::{Daemon, children, command, first_line, sleeper};
 use std::process::Command;
 use std::time::{Duration, Instant};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
 
 #[test]
 fn daemon_starts_and_ends_without_a_trace() {
@@ -94,4 +97,70 @@ fn every_unusable_directory_is_named_on_one_line() {
     let line = first_line(&mut child);
     assert_eq!(child.wait().unwrap().code(), Some(1));
     assert_eq!(line.matches("cannot use directory").count(), 2, "{line}");
+}
+
+async fn health(daemon: &Daemon) -> ServingStatus {
+    let mut client = HealthClient::new(daemon.channel("jobs.sock").await);
+    let service = "pbgi.v1.JobService".into();
+    let answer = client.check(HealthCheckRequest { service }).await.unwrap();
+    answer.into_inner().status()
+}
+
+#[tokio::test]
+async fn daemon_whose_workers_cannot_start_says_so_and_lives() {
+    let daemon = Daemon::start(|_| "/bin/false".into(), |_| {});
+    let deadline = Instant::now() + Duration::from_secs(20);
+    while health(&daemon).await != ServingStatus::NotServing {
+        assert!(Instant::now() < deadline, "still serving: {}", daemon.log());
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert_eq!(
+        daemon.log().matches("worker died").count(),
+        10,
+        "five deaths for each of two slots"
+    );
+    daemon.stop();
+}
+
+#[tokio::test]
+async fn health_and_both_reflections_answer_clients() {
+    use tonic_reflection::pb::{v1, v1alpha};
+    let daemon = Daemon::start(sleeper, |_| {});
+    assert_eq!(health(&daemon).await, ServingStatus::Serving);
+    macro_rules! services {
+        ($version:ident) => {{
+            let channel = daemon.channel("jobs.sock").await;
+            let mut client = $version::server_reflection_client::ServerReflectionClient::new(channel);
+            let request = $version::ServerReflectionRequest {
+                host: String::new(),
+                message_request: Some($version::server_reflection_request::MessageRequest::ListServices(
+                    String::new(),
+                )),
+            };
+            let stream = client
+                .server_reflection_info(tokio_stream::once(request))
+                .await
+                .unwrap();
+            let answer = stream
+                .into_inner()
+                .message()
+                .await
+                .unwrap()
+                .unwrap()
+                .message_response
+                .unwrap();
+            let $version::server_reflection_response::MessageResponse::ListServicesResponse(list) = answer else {
+                panic!("not a list: {answer:?}")
+            };
+            list.service
+                .into_iter()
+                .map(|service| service.name)
+                .collect::<Vec<String>>()
+        }};
+    }
+    for names in [services!(v1), services!(v1alpha)] {
+        assert!(names.iter().any(|name| name == "pbgi.v1.JobService"), "{names:?}");
+        assert!(!names.iter().any(|name| name.contains("Queue")), "{names:?}");
+    }
+    daemon.stop();
 }
