@@ -307,7 +307,8 @@ fn column(sin: f32, cos: f32, resolution: f32) -> u32 {
     let half_share = (arcsine + s * cos.max(0.0)) * FRAC_1_PI;
     let share = 0.5 + half_share.copysign(sin);
     // The sum's last bits are the rounded integer; a cast would check for what cannot be.
-    (share * resolution + INTEGER_SHIFT).to_bits() & COLUMN_MASK
+    // Not a number (a row through the sphere's own axis) becomes any column; its row is known to be missed.
+    ((share * resolution + INTEGER_SHIFT).to_bits() & COLUMN_MASK).min(RESOLUTION_MAX as u32)
 }
 
 /// A word whose bits are set with probability `density` (in steps of 1/16), always the same for a seed.
