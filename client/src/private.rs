@@ -80,7 +80,9 @@ impl Folders {
 
     /// What names of this user's daemons begin with.
     fn prefix(&self) -> String {
-        let hash = fnv([self.state.as_os_str(), self.cache.as_os_str()].map(|part| part.as_encoded_bytes()));
+        // Every folder counts: two daemons with one state folder and different sockets would be in each other's way.
+        let folders = [&self.runtime, &self.state, &self.cache];
+        let hash = fnv(folders.map(|folder| folder.as_os_str().as_encoded_bytes()));
         format!("{:08x}-", hash as u32)
     }
 
