@@ -1,6 +1,7 @@
 //! A node as a receiver sees it: whether it may stand for what is below it, and where its surface lies.
 
 use crate::cut::Visit;
+use crate::footprint::SectionBox;
 use crate::shader::Receiver;
 use glam::{Vec2, Vec3};
 use half::slice::HalfFloatSliceExt;
@@ -29,6 +30,13 @@ const ARC_SLACK_OPPOSED: f32 = 0.03;
 /// Distance in voxel edges, and in radii of a disc, within which an element may be the receiver's own surface.
 const NEAR_VOXELS: f32 = 2.5;
 
+/// How far a section reaches beyond a uniform covering with the points' variance, which a few points know only roughly ...
+const REACH_SCALE: f32 = 1.15;
+/// ... and beyond that, in radii.
+const REACH_RADII: f32 = 0.5;
+/// Overlap of sections with their neighbours, as a share of half a voxel's edge, for a spread of 1.
+const SECTION_OVERLAP: f32 = 0.1;
+
 /// A node in plain numbers, seen from one receiver.
 pub(crate) struct Cluster {
     /// Relative to the receiver.
@@ -39,6 +47,10 @@ pub(crate) struct Cluster {
     pub(crate) covariance: [f32; 6],
     pub(crate) area: f32,
     pub(crate) fill: f32,
+    /// Root mean square sine between normals and axis.
+    spread: f32,
+    /// Largest radius of a point, nearly.
+    radius: f32,
     pub(crate) flat: bool,
     /// Receiver within the voxel's sphere.
     pub(crate) close: bool,
@@ -75,12 +87,27 @@ impl Cluster {
             covariance,
             area: node.sh[0][0].to_f32() * normaliser / AREA_TERM,
             fill: node.fill(),
+            spread: node.spread(),
+            radius: node.radius_ratio() * edge,
             flat,
             close: visit.center.length_squared() < 3.0 * visit.half * visit.half * 1.2,
             own_surface,
             normaliser,
             sh: node.sh,
         }
+    }
+
+    /// The part of the voxel that a flat cluster's surface reaches. Sections of neighbours on a curved surface lie in
+    /// different planes, so they are made to overlap; a surface that ends inside the voxel ends where its points do.
+    #[inline(always)]
+    pub(crate) fn section_box(&self, visit: &Visit) -> SectionBox {
+        let variance = Vec3::new(self.covariance[0], self.covariance[1], self.covariance[2]).max(Vec3::ZERO);
+        // A uniform segment reaches the square root of three standard deviations.
+        let spread = Vec3::new(variance.x.sqrt(), variance.y.sqrt(), variance.z.sqrt()) * 1.732_051;
+        let reach = spread * REACH_SCALE + Vec3::splat(REACH_RADII * self.radius);
+        let slack = SECTION_OVERLAP * self.spread;
+        SectionBox::voxel(visit.center, visit.half, self.axis, slack)
+            .within(self.centroid - reach, self.centroid + reach)
     }
 
     /// Whether the cluster may stand for what is below it.

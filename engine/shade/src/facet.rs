@@ -1,6 +1,8 @@
 //! Edges and corners: a leaf whose points lie on two or three planes is drawn as those planes' pieces of its voxel, each cut
 //! by the others, so that walls meet in a line instead of a fringe of discs.
 
+use crate::cut::Visit;
+use crate::footprint::SectionBox;
 use glam::{DVec3, Vec3};
 use pbgi_core::PointRecord;
 use pbgi_core::section::{HalfSpace, section_area, voxel_half_spaces};
@@ -15,6 +17,8 @@ const PLANE_REACH: f32 = 0.3;
 const PARALLEL: f32 = 0.9;
 /// How far points may lie beyond a plane that still cuts their facet, as a share of their radius.
 const BEYOND: f32 = 0.5;
+/// How far a facet reaches beyond its points' centres, in radii: a little over the distance between points.
+const POINT_REACH: f32 = 2.0;
 /// Membership is kept in one word.
 const POINTS_MAX: usize = 64;
 
@@ -25,6 +29,9 @@ pub(crate) struct Facet {
     pub(crate) centroid: Vec3,
     pub(crate) area: f32,
     pub(crate) radius: f32,
+    /// Box around the points' centres.
+    low: Vec3,
+    high: Vec3,
     /// Radiance times area of the side the normal points to, and of the other.
     pub(crate) power: [Vec3; 2],
     /// Which points of the leaf lie on it.
@@ -45,6 +52,8 @@ pub(crate) fn facets(points: &[(f32, PointRecord)], receiver: Vec3) -> Option<([
         centroid: Vec3::ZERO,
         area: 0.0,
         radius: 0.0,
+        low: Vec3::INFINITY,
+        high: Vec3::NEG_INFINITY,
         power: [Vec3::ZERO; 2],
         members: 0,
     };
@@ -91,9 +100,18 @@ impl Facet {
         self.centroid += position * area;
         self.area += area;
         self.radius = self.radius.max(point.radius);
+        self.low = self.low.min(position);
+        self.high = self.high.max(position);
         self.power[0] += front;
         self.power[1] += back;
         self.members |= 1 << index;
+    }
+
+    /// The part of the voxel that its points reach.
+    #[inline(always)]
+    pub(crate) fn section_box(&self, visit: &Visit) -> SectionBox {
+        let reach = Vec3::splat(POINT_REACH * self.radius);
+        SectionBox::voxel(visit.center, visit.half, self.normal, 0.0).within(self.low - reach, self.high + reach)
     }
 
     /// The other facets' planes where all points of this one lie on one side.

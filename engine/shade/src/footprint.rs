@@ -42,6 +42,35 @@ pub(crate) struct Plane {
     pub(crate) distance: f32,
 }
 
+/// The box in which a plane is drawn: a voxel, less the part that its points do not reach; relative to the receiver.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SectionBox {
+    low: Vec3,
+    high: Vec3,
+}
+
+impl SectionBox {
+    /// A voxel, larger by the share `slack` of its half edge. A plane along a face must not fall out of it by rounding.
+    #[inline(always)]
+    pub(crate) fn voxel(center: Vec3, half: f32, normal: Vec3, slack: f32) -> Self {
+        let along = normal.abs().cmpgt(Vec3::splat(ALONG_FACE));
+        let reach = Vec3::splat(half * (1.0 + slack)) + Vec3::select(along, Vec3::splat(half * FACE_SLACK), Vec3::ZERO);
+        Self {
+            low: center - reach,
+            high: center + reach,
+        }
+    }
+
+    /// The part between two corners.
+    #[inline(always)]
+    pub(crate) fn within(self, low: Vec3, high: Vec3) -> Self {
+        Self {
+            low: self.low.max(low),
+            high: self.high.min(high),
+        }
+    }
+}
+
 impl Plane {
     /// Through `point` (relative to the receiver) with `normal`, turned away from the receiver. A receiver within `touch`
     /// of the plane is taken to stand that far in front of it: at the foot of a wall the wall hides half of the sky.
@@ -127,20 +156,18 @@ impl Footprint {
         footprint
     }
 
-    /// Where a plane cuts a voxel; `center` of the voxel relative to the receiver, `half` its half edge.
+    /// Where a plane cuts a box.
     #[inline(always)]
-    pub(crate) fn voxel_section(frame: &Frame, center: Vec3, half: f32, plane: Plane) -> Self {
+    pub(crate) fn section(frame: &Frame, bounds: SectionBox, plane: Plane) -> Self {
+        let SectionBox { low, high } = bounds;
         let normal = frame.local_from_world(plane.normal);
-        let mut footprint = Self::empty(frame.local_from_world(center), half * 1.732_051);
-        for (axis, middle) in [(Vec3::X, center.x), (Vec3::Y, center.y), (Vec3::Z, center.z)] {
-            // A plane along a face of the voxel must not fall out of it by rounding.
-            let half = if axis.dot(plane.normal).abs() > ALONG_FACE {
-                half * (1.0 + FACE_SLACK)
-            } else {
-                half
-            };
-            let axis = frame.local_from_world(axis);
-            footprint.add_slab(normal, plane.distance, axis, middle - half, middle + half);
+        let mut footprint = Self::empty(frame.local_from_world((low + high) * 0.5), (high - low).length() * 0.5);
+        for (axis, low, high) in [
+            (Vec3::X, low.x, high.x),
+            (Vec3::Y, low.y, high.y),
+            (Vec3::Z, low.z, high.z),
+        ] {
+            footprint.add_slab(normal, plane.distance, frame.local_from_world(axis), low, high);
         }
         footprint
     }

@@ -73,7 +73,7 @@ impl Painter<'_> {
         let plane = Plane::through(cluster.centroid, cluster.axis, TOUCH * visit.half);
         let toward = cluster.axis.dot(cluster.centroid) < 0.0;
         let (footprint, drawn_area) = if cluster.fill >= SECTION_FILL {
-            let section = Footprint::voxel_section(self.frame, visit.center, visit.half, plane);
+            let section = Footprint::section(self.frame, cluster.section_box(visit), plane);
             (section, cluster.area / cluster.fill)
         } else {
             self.rectangle(cluster, plane)
@@ -187,7 +187,7 @@ impl Painter<'_> {
         if touched || continues_surface(receiver.normal, facet.normal, facet.centroid) {
             return;
         }
-        let mut footprint = Footprint::voxel_section(self.frame, visit.center, visit.half, plane);
+        let mut footprint = Footprint::section(self.frame, facet.section_box(visit), plane);
         for (normal, distance) in cuts {
             footprint.cut(self.frame, plane, *normal, *distance);
         }
