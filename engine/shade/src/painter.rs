@@ -5,7 +5,7 @@ use crate::cut::{Seen, Visit, Walk};
 use crate::facet::{Facet, facets};
 use crate::footprint::{Footprint, Plane};
 use crate::frame::Frame;
-use crate::raster::{Ink, Raster};
+use crate::raster::{Covered, Ink, Raster};
 use crate::shader::Receiver;
 use glam::Vec3;
 use pbgi_core::PointRecord;
@@ -79,8 +79,8 @@ impl Painter<'_> {
             self.rectangle(cluster, plane)
         };
         let distance = cluster.distance_squared.sqrt();
-        let count = self.cover(&footprint, 1.0, distance, visit);
-        if count > 0 {
+        let covered = self.cover(&footprint, 1.0, distance, visit);
+        if covered.bits > 0 {
             let (even, odd) = cluster.evaluate(cluster.axis);
             let power = |sign: f32| {
                 Vec3::new(
@@ -97,7 +97,7 @@ impl Painter<'_> {
             } else {
                 cluster.area
             };
-            self.seen.radiance += power * (cluster.normaliser / area) * count as f32;
+            self.seen.radiance += power * (cluster.normaliser / area) * covered.light;
         }
     }
 
@@ -142,11 +142,11 @@ impl Painter<'_> {
         let local = |v| self.frame.local_from_world(v);
         let sides = [(local(u), a), (local(v), b)];
         let footprint = Footprint::rectangle(local(cluster.centroid), local(plane.normal), distance, sides);
-        let count = self.cover(&footprint, density, distance, visit);
-        if count > 0 {
+        let covered = self.cover(&footprint, density, distance, visit);
+        if covered.bits > 0 {
             let power = Vec3::new(even[1] + odd[1], even[2] + odd[2], even[3] + odd[3]).max(Vec3::ZERO);
             let drawn = (4.0 * a * b * density).min(shown).max(1e-30);
-            self.seen.radiance += power * (cluster.normaliser / drawn) * count as f32;
+            self.seen.radiance += power * (cluster.normaliser / drawn) * covered.light;
         }
     }
 
@@ -191,10 +191,10 @@ impl Painter<'_> {
         for (normal, distance) in cuts {
             footprint.cut(self.frame, plane, *normal, *distance);
         }
-        let count = self.cover(&footprint, 1.0, facet.centroid.length(), visit);
-        if count > 0 {
+        let covered = self.cover(&footprint, 1.0, facet.centroid.length(), visit);
+        if covered.bits > 0 {
             let side = usize::from(facet.normal.dot(facet.centroid) > 0.0);
-            self.seen.radiance += facet.power[side] / facet.area * count as f32;
+            self.seen.radiance += facet.power[side] / facet.area * covered.light;
         }
     }
 
@@ -213,7 +213,7 @@ impl Painter<'_> {
         }
         let footprint = Footprint::disc(self.frame, center, plane, point.radius * DISC_SCALE);
         let weight = self.weight(distance, point.radius);
-        let count = self.walk.simd.cover(
+        let covered = self.walk.simd.cover(
             self.raster,
             self.walk.tables,
             &footprint,
@@ -223,29 +223,29 @@ impl Painter<'_> {
                 seed: 0,
             },
         );
-        if count > 0 {
+        if covered.bits > 0 {
             let sides = point.sides();
             let radiance = if normal.dot(center) < 0.0 {
                 sides.front
             } else {
                 sides.back
             };
-            self.seen.radiance += Vec3::from(radiance) * count as f32;
-            self.seen.occlusion += weight * count as f32;
+            self.seen.radiance += Vec3::from(radiance) * covered.light;
+            self.seen.occlusion += weight * covered.bits as f32;
         }
     }
 
     #[inline(always)]
-    fn cover(&mut self, footprint: &Footprint, density: f32, distance: f32, visit: &Visit) -> u32 {
+    fn cover(&mut self, footprint: &Footprint, density: f32, distance: f32, visit: &Visit) -> Covered {
         let weight = self.weight(distance, visit.half);
         let ink = Ink {
             density,
             weight,
             seed: visit.path,
         };
-        let count = self.walk.simd.cover(self.raster, self.walk.tables, footprint, ink);
-        self.seen.occlusion += weight * count as f32;
-        count
+        let covered = self.walk.simd.cover(self.raster, self.walk.tables, footprint, ink);
+        self.seen.occlusion += weight * covered.bits as f32;
+        covered
     }
 
     /// How much a surface at `distance`, reaching `extent` to both sides, counts as an occluder.

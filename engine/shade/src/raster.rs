@@ -96,6 +96,20 @@ pub(crate) struct Ink {
     pub(crate) seed: u64,
 }
 
+/// What a footprint added to the raster.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Covered {
+    /// Bits that were open before.
+    pub(crate) bits: u32,
+    /// The same as an area, free of the steps of the columns: the share of the footprint that was open times its length
+    /// along all rows, in columns. A bright light then fades smoothly where its edge crosses bits.
+    pub(crate) light: f32,
+}
+
+/// Bits from which a footprint's length along the rows is a better measure than its bits; below, those that happen to be hit
+/// stand for those that are not.
+const EXACT_BITS: u32 = 64;
+
 impl Raster {
     pub(crate) fn new() -> Self {
         Self {
@@ -117,17 +131,19 @@ impl Raster {
 
     /// Covers a footprint's bits and counts those that were open.
     #[inline(always)]
-    pub(crate) fn cover(&mut self, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> u32 {
+    pub(crate) fn cover(&mut self, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> Covered {
         let Ink { density, weight, seed } = ink;
-        let mut count = 0;
+        let (mut count, mut drawn, mut length) = (0, 0, 0.0);
         let blocks = footprint.rows(tables.resolution);
         for block in blocks {
-            let masks = footprint_masks(tables, footprint, block);
+            let (masks, block_length) = footprint_masks(tables, footprint, block);
+            length += block_length;
             for (lane, mut mask) in masks.into_iter().enumerate() {
                 let row = block * LANES + lane;
                 if density < 1.0 {
                     mask &= sparse_bits(seed ^ row as u64, density);
                 }
+                drawn += mask.count_ones();
                 let newly = mask & !self.covered[row];
                 count += newly.count_ones();
                 self.covered[row] |= mask;
@@ -139,7 +155,13 @@ impl Raster {
             }
         }
         self.covered_count += count;
-        count
+        let exact = drawn >= EXACT_BITS && density >= 1.0;
+        let light = if exact {
+            count as f32 * (length / drawn as f32)
+        } else {
+            count as f32
+        };
+        Covered { bits: count, light }
     }
 
     /// Whether every bit in which a sphere shows is covered already; `center` in the receiver's frame, farther than `radius`.
@@ -191,7 +213,7 @@ impl Raster {
 
 /// Bits of eight rows that lie inside a footprint.
 #[inline(always)]
-fn footprint_masks(tables: &RasterTables, footprint: &Footprint, block: usize) -> [u64; LANES] {
+fn footprint_masks(tables: &RasterTables, footprint: &Footprint, block: usize) -> ([u64; LANES], f32) {
     let start = block * LANES;
     let (mut low, mut high) = ([-FAR; LANES], [FAR; LANES]);
     for plane in footprint.half_spaces() {
@@ -219,10 +241,12 @@ fn footprint_masks(tables: &RasterTables, footprint: &Footprint, block: usize) -
     }
     let (first, end) = (columns(&low, tables.resolution), columns(&high, tables.resolution));
     let mut masks = [0; LANES];
+    let mut lengths = [0.0; LANES];
     for lane in 0..LANES {
-        masks[lane] = run_mask(first[lane], end[lane]);
+        masks[lane] = run_mask(rounded(first[lane]), rounded(end[lane]));
+        lengths[lane] = (end[lane] - first[lane]).max(0.0);
     }
-    masks
+    (masks, lengths.iter().sum())
 }
 
 /// Bits from `first` up to, not including, `end`; both at most 64.
@@ -233,10 +257,10 @@ fn run_mask(first: u32, end: u32) -> u64 {
     below(end) & !below(first)
 }
 
-/// Number of column middles below each tangent.
+/// Where each tangent lies along a row, in columns.
 #[inline(always)]
-fn columns(tangent: &[f32; LANES], resolution: usize) -> [u32; LANES] {
-    let mut result = [0; LANES];
+fn columns(tangent: &[f32; LANES], resolution: usize) -> [f32; LANES] {
+    let mut result = [0.0; LANES];
     for lane in 0..LANES {
         let tangent = tangent[lane].clamp(-FAR, FAR);
         let cos = 1.0 / (1.0 + tangent * tangent).sqrt();
@@ -273,8 +297,8 @@ fn sphere_masks(tables: &RasterTables, center: glam::Vec3, radius: f32, block: u
     for lane in 0..LANES {
         let low = select(sign_mask(low_cos[lane]), -1.0, low[lane]);
         let high = select(sign_mask(high_cos[lane]), 1.0, high[lane]);
-        first[lane] = column(low, low_cos[lane], resolution);
-        end[lane] = column(high, high_cos[lane], resolution) & seen[lane];
+        first[lane] = rounded(column(low, low_cos[lane], resolution));
+        end[lane] = rounded(column(high, high_cos[lane], resolution)) & seen[lane];
     }
     let mut masks = [0; LANES];
     for lane in 0..LANES {
@@ -294,21 +318,26 @@ fn select(mask: u32, set: f32, clear: f32) -> f32 {
     f32::from_bits((set.to_bits() & mask) | (clear.to_bits() & !mask))
 }
 
-/// Number of column middles below an angle: `resolution (a + sin a cos a) / pi`, rounded. The arcsine is the polynomial
+/// Where an angle lies along a row, in columns: `resolution ((a + sin a cos a) / pi + 1/2)`. The arcsine is the polynomial
 /// 4.4.45 of Abramowitz and Stegun, whose error (7e-5) is a thousandth of a column.
 #[inline(always)]
-fn column(sin: f32, cos: f32, resolution: f32) -> u32 {
-    /// 2^23: floats from here on are integers.
-    const INTEGER_SHIFT: f32 = 8_388_608.0;
-    const COLUMN_MASK: u32 = 0x7f;
+fn column(sin: f32, cos: f32, resolution: f32) -> f32 {
     let s = sin.abs().min(1.0);
     let polynomial = 1.570_728_8 + s * (-0.212_114_4 + s * (0.074_261 - s * 0.018_729_3));
     let arcsine = PI / 2.0 - (1.0 - s).sqrt() * polynomial;
     let half_share = (arcsine + s * cos.max(0.0)) * FRAC_1_PI;
-    let share = 0.5 + half_share.copysign(sin);
-    // The sum's last bits are the rounded integer; a cast would check for what cannot be.
-    // Not a number (a row through the sphere's own axis) becomes any column; its row is known to be missed.
-    ((share * resolution + INTEGER_SHIFT).to_bits() & COLUMN_MASK).min(RESOLUTION_MAX as u32)
+    (0.5 + half_share.copysign(sin)) * resolution
+}
+
+/// Number of column middles below a place along a row.
+#[inline(always)]
+fn rounded(column: f32) -> u32 {
+    /// 2^23: floats from here on are integers.
+    const INTEGER_SHIFT: f32 = 8_388_608.0;
+    const COLUMN_MASK: u32 = 0x7f;
+    // The sum's last bits are the rounded integer; a cast would check for what cannot be. Not a number (a row through the
+    // sphere's own axis) becomes any column; its row is known to be missed.
+    ((column + INTEGER_SHIFT).to_bits() & COLUMN_MASK).min(RESOLUTION_MAX as u32)
 }
 
 /// A word whose bits are set with probability `density` (in steps of 1/16), always the same for a seed.
@@ -361,7 +390,7 @@ mod tests {
             let turned = |x, y| (Vec3::new(x, y, 0.0), half);
             let sides = [turned(0.893_96, 0.448_14), turned(-0.448_14, 0.893_96)];
             let square = Footprint::rectangle(Vec3::Z, Vec3::Z, 1.0, sides);
-            let count = raster.cover(&tables, &square, SOLID);
+            let count = raster.cover(&tables, &square, SOLID).bits;
             // Form factor of a parallel square from a point below its centre: four times that of a quarter.
             let x = half / (1.0 + half * half).sqrt();
             let quarter = x * (half / (1.0 + half * half).sqrt()).atan() / PI;
@@ -402,8 +431,8 @@ mod tests {
         let mut raster = Raster::new();
         let square = Footprint::rectangle(Vec3::new(0.3, 0.2, 1.0), Vec3::Z, 1.0, [(Vec3::X, 0.4), (Vec3::Y, 0.4)]);
         assert!(!raster.hides_sphere(&tables, Vec3::new(0.3, 0.2, 1.0), 0.2));
-        assert!(raster.cover(&tables, &square, SOLID) > 0);
-        assert_eq!(raster.cover(&tables, &square, SOLID), 0);
+        assert!(raster.cover(&tables, &square, SOLID).bits > 0);
+        assert_eq!(raster.cover(&tables, &square, SOLID).bits, 0);
         assert!(raster.hides_sphere(&tables, Vec3::new(0.3, 0.2, 1.0), 0.2));
         assert!(!raster.hides_sphere(&tables, Vec3::new(0.3, 0.2, 1.0), 0.7));
     }

@@ -7,7 +7,7 @@
 )]
 
 use crate::footprint::Footprint;
-use crate::raster::{Ink, Raster, RasterTables};
+use crate::raster::{Covered, Ink, Raster, RasterTables};
 use glam::Vec3;
 
 /// Instruction set of the kernels.
@@ -37,7 +37,7 @@ impl Simd {
     }
 
     /// [`Raster::cover`]. Both ways compute the same bits: no operation is contracted or reordered.
-    pub(crate) fn cover(self, raster: &mut Raster, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> u32 {
+    pub(crate) fn cover(self, raster: &mut Raster, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> Covered {
         match self {
             #[cfg(target_arch = "x86_64")]
             // SAFETY: `Avx2` is only made by `detect`, after every feature that the function is compiled for was found.
@@ -59,7 +59,7 @@ impl Simd {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
-fn cover_avx2(raster: &mut Raster, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> u32 {
+fn cover_avx2(raster: &mut Raster, tables: &RasterTables, footprint: &Footprint, ink: Ink) -> Covered {
     raster.cover(tables, footprint, ink)
 }
 
