@@ -63,13 +63,15 @@ impl Queue {
         }
     }
 
-    /// What a job is about.
-    pub(crate) async fn task(&mut self, task_id: u64) -> Result<v1::Task, WorkerError> {
+    /// What a job is about; `None` if it has ended since its tile was handed out.
+    pub(crate) async fn task(&mut self, task_id: u64) -> Result<Option<v1::Task>, WorkerError> {
         let seat = Some(self.seat);
         let request = self.request(v1::GetTaskRequest { seat, task_id }, REQUEST_SECS);
-        let answer = self.client.get_task(request).await;
-        let answer = answer.map_err(|status| failed("describe a task", &status))?;
-        Ok(answer.into_inner())
+        match self.client.get_task(request).await {
+            Ok(answer) => Ok(Some(answer.into_inner())),
+            Err(status) if status.code() == Code::NotFound => Ok(None),
+            Err(status) => Err(failed("describe a task", &status)),
+        }
     }
 
     /// Hands in a tile; `false` if the lease had ended.

@@ -21,9 +21,10 @@ pub(crate) async fn serve(mut queue: Queue, shader: SyncSender<Order>) -> Result
     let mut tasks = Tasks(Vec::new());
     loop {
         let Some(lease) = queue.lease().await? else { continue };
-        let outcome = match order(&mut queue, &mut tasks, &lease).await? {
-            Ok((task, tile)) => shade(&mut queue, &shader, task, tile).await?,
-            Err(message) => Some(Outcome::Failure(v1::TileFailure {
+        let outcome = match work(&mut queue, &mut tasks, &lease).await? {
+            Work::Tile(task, tile) => shade(&mut queue, &shader, task, tile).await?,
+            Work::Ended => None,
+            Work::Nonsense(message) => Some(Outcome::Failure(v1::TileFailure {
                 kind: FailureKind::Internal.name().to_owned(),
                 message,
             })),
@@ -36,21 +37,30 @@ pub(crate) async fn serve(mut queue: Queue, shader: SyncSender<Order>) -> Result
     }
 }
 
-/// The work that a lease stands for; the inner error is a message that makes no sense.
-async fn order(
-    queue: &mut Queue,
-    tasks: &mut Tasks,
-    lease: &v1::Lease,
-) -> Result<Result<(Arc<Task>, Tile), String>, WorkerError> {
+/// What a lease stands for.
+enum Work {
+    Tile(Arc<Task>, Tile),
+    /// Its job is over, cancelled most likely.
+    Ended,
+    /// A message that makes no sense.
+    Nonsense(String),
+}
+
+async fn work(queue: &mut Queue, tasks: &mut Tasks, lease: &v1::Lease) -> Result<Work, WorkerError> {
     let tile = match Tile::from_wire(lease) {
         Ok(tile) => tile,
-        Err(fault) => return Ok(Err(fault)),
+        Err(fault) => return Ok(Work::Nonsense(fault)),
     };
     if let Some(task) = tasks.get(tile.task_id) {
-        return Ok(Ok((task, tile)));
+        return Ok(Work::Tile(task, tile));
     }
-    let wire = queue.task(tile.task_id).await?;
-    Ok(Task::from_wire(tile.task_id, wire).map(|task| (tasks.keep(task), tile)))
+    let Some(wire) = queue.task(tile.task_id).await? else {
+        return Ok(Work::Ended);
+    };
+    Ok(match Task::from_wire(tile.task_id, wire) {
+        Ok(task) => Work::Tile(tasks.keep(task), tile),
+        Err(fault) => Work::Nonsense(fault),
+    })
 }
 
 /// Has a tile shaded while its lease is kept alive; `None` if the lease ended meanwhile.
