@@ -3,7 +3,7 @@
 //!
 //! Start at [`Scene`] to read a built octree, at [`SceneWriter`] to write one, at [`AtomicFile`] for any other output
 //! file. All of them reach the disk through [`Volume`] and [`Storage`], so that the doubles of `testsuite` (a feature)
-//! can fail or crash any operation. The formats are drawn in `docs/format.md` beside this crate. Nothing here is ever
+//! can fail or crash any operation. The formats are drawn in `docs/format.md`. Nothing here is ever
 //! mapped into memory, and nothing here knows what points and nodes mean.
 #![forbid(unsafe_code)]
 
