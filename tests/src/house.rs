@@ -1,8 +1,14 @@
 //! A house of its own for every test: fresh folders, a private daemon, and a look around when it is over.
 
+use nix::sys::signal::Signal;
+use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+/// Options of the daemon that most tests share: small, with two workers.
+pub const DAEMON: &str = "--memory 256M --workers 2";
 
 /// The workspace's root.
 pub fn workspace_root() -> PathBuf {
@@ -65,6 +71,58 @@ impl Run {
     }
 }
 
+/// A command that was started; it is waited for with [`Job::end`] and killed if it is dropped before.
+#[derive(Debug)]
+pub struct Job(Child);
+
+impl Job {
+    /// Whether it still runs.
+    pub fn runs(&mut self) -> bool {
+        self.0.try_wait().unwrap().is_none()
+    }
+
+    /// Waits for its end.
+    pub fn end(mut self) -> Run {
+        let read = |pipe: &mut dyn Read| {
+            let mut bytes = vec![];
+            pipe.read_to_end(&mut bytes).unwrap();
+            String::from_utf8_lossy(&bytes).into_owned()
+        };
+        // What a command says fits a pipe, so one after the other will do.
+        let stderr = read(self.0.stderr.as_mut().unwrap());
+        let stdout = read(self.0.stdout.as_mut().unwrap());
+        let code = self.0.wait().unwrap().code();
+        Run { code, stdout, stderr }
+    }
+}
+
+impl Drop for Job {
+    fn drop(&mut self) {
+        // It may have ended in good order.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Sends a signal; the process may be gone.
+pub fn signal(pid: i32, signal: Signal) {
+    let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), signal);
+}
+
+/// Looks every 10 ms whether something holds; false if it never did.
+pub fn wait_for(most: Duration, mut holds: impl FnMut() -> bool) -> bool {
+    let deadline = Instant::now() + most;
+    loop {
+        if holds() {
+            return true;
+        }
+        if Instant::now() > deadline {
+            return false;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
 impl From<Output> for Run {
     fn from(output: Output) -> Self {
         Self {
@@ -92,7 +150,12 @@ impl House {
 
     /// The command line, ready for arguments, with an environment that leads nowhere but here.
     pub fn client(&self) -> Command {
-        let mut command = Command::new(program("pbgi-client"));
+        self.command(program("pbgi-client"))
+    }
+
+    /// Another program in the same environment.
+    pub fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
+        let mut command = Command::new(program);
         command.env_clear().current_dir(self.root.path()).stdin(Stdio::null());
         for variable in ["PATH", "RUST_LOG", "RUST_BACKTRACE"] {
             if let Some(value) = std::env::var_os(variable) {
@@ -111,6 +174,28 @@ impl House {
     /// Runs the command line to its end.
     pub fn run<S: AsRef<std::ffi::OsStr>>(&self, arguments: impl IntoIterator<Item = S>) -> Run {
         self.client().args(arguments).output().unwrap().into()
+    }
+
+    /// Runs the command line with arguments separated by blanks.
+    pub fn line(&self, line: &str) -> Run {
+        self.run(line.split_whitespace())
+    }
+
+    /// Starts the command line with arguments separated by blanks, and lets it run.
+    pub fn start(&self, line: &str) -> Job {
+        let mut command = self.client();
+        command.args(line.split_whitespace());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
+        Job(command.spawn().unwrap())
+    }
+
+    /// Makes the demo's room: `demo.glb`, its points `demo.ply`, its passes `g.exr`, and the octree `demo.pbgi`.
+    pub fn furnish(&self, points: u32, size: &str) {
+        pbgi_points::demo::write_glb(&self.path("demo.glb")).unwrap();
+        self.line(&format!("sample demo.glb -o demo.ply --points {points}"))
+            .ok();
+        self.line(&format!("gbuffer demo.glb -o g.exr --size {size}")).ok();
+        self.line(&format!("build demo.ply -o demo.pbgi {DAEMON}")).ok();
     }
 
     /// The statistics a command wrote with `--stats`.
@@ -139,19 +224,62 @@ impl House {
         found
     }
 
+    /// Ids of the house's processes that run this program for the long term: no build child, no command line.
+    pub fn running(&self, program: &str) -> Vec<i32> {
+        let found = self.processes().into_iter();
+        let mine = |command: &String| {
+            let name = command.split(' ').next().unwrap_or_default();
+            name.ends_with(program) && !command.contains("build-child")
+        };
+        found.filter(|(_, command)| mine(command)).map(|(pid, _)| pid).collect()
+    }
+
+    /// Shared memory segments that the house's state files name: state file and segment.
+    pub fn segments(&self) -> Vec<(PathBuf, PathBuf)> {
+        let state = self.path("home").join("XDG_STATE_HOME/pbgi");
+        let notes = std::fs::read_dir(state).into_iter().flatten().flatten();
+        let named = notes.filter_map(|seat| {
+            let note = seat.path().join("segment");
+            let name = std::fs::read_to_string(&note).ok()?;
+            Some((note, Path::new("/dev/shm").join(name.trim().trim_start_matches('/'))))
+        });
+        named.collect()
+    }
+
+    /// Share of a running shading job, from 0 to 1: what `jobs` says; `None` if none runs.
+    pub fn share(&self) -> Option<f64> {
+        let jobs = self.line("jobs").ok().stdout;
+        let mut fields = jobs.lines().map(|line| line.split_whitespace());
+        let mut running = fields.find(|fields| {
+            let mut fields = fields.clone();
+            fields.next().is_some_and(|id| id.starts_with("shade-")) && fields.next() == Some("running")
+        })?;
+        let share = running.nth(2)?.trim_end_matches('%').parse::<f64>().ok()?;
+        Some(share / 100.0)
+    }
+
+    /// Kills workers while a shading job has tiles outstanding, by turns one and all of them. Returns false if the job
+    /// was over too soon: then nobody was killed.
+    pub fn kill_workers(&self, all: bool) -> bool {
+        // They are stopped first, so that what is outstanding stays so while we look.
+        let workers = self.running("pbgi-worker");
+        for &pid in &workers {
+            signal(pid, Signal::SIGSTOP);
+        }
+        let outstanding = !workers.is_empty() && self.share().is_some_and(|share| share > 0.0 && share < 1.0);
+        for (index, &pid) in workers.iter().enumerate() {
+            let kill = outstanding && (all || index == 0);
+            signal(pid, if kill { Signal::SIGKILL } else { Signal::SIGCONT });
+        }
+        outstanding
+    }
+
     /// Ends every daemon of the house in good order.
     pub fn shutdown(&self) {
-        for (pid, command) in self.processes() {
-            if command.contains("pbgi-server") && !command.contains("build-child") {
-                let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGTERM);
-            }
+        for pid in self.running("pbgi-server") {
+            signal(pid, Signal::SIGTERM);
         }
-        for _ in 0..1_000 {
-            if self.processes().is_empty() {
-                return;
-            }
-            std::thread::sleep(std::time::Duration::from_millis(10));
-        }
+        wait_for(Duration::from_secs(10), || self.processes().is_empty());
     }
 }
 
@@ -166,7 +294,7 @@ impl Drop for House {
         self.shutdown();
         let left = self.processes();
         for (pid, _) in &left {
-            let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(*pid), nix::sys::signal::Signal::SIGKILL);
+            signal(*pid, Signal::SIGKILL);
         }
         if !std::thread::panicking() {
             assert!(left.is_empty(), "processes outlived the test: {left:?}");

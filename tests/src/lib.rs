@@ -12,9 +12,12 @@
 
 mod house;
 mod picture;
+mod scene;
 
-pub use house::{House, Run, program, workspace_root};
+pub use house::{DAEMON, House, Job, Run, program, signal, wait_for, workspace_root};
+pub use nix::sys::signal::Signal;
 pub use picture::{Picture, relative_rms, rms};
+pub use scene::{flip_bit, page_count};
 
 use std::path::PathBuf;
 
