@@ -1,4 +1,4 @@
-//! Real spherical harmonics of three bands: the directional memory of a cluster ([Chr08] section 3.2).
+//! Real spherical harmonics of three bands: the directional memory of a cluster (Christensen 2008, section 3.2).
 //!
 //! A disc of area `a` with normal `n` shows the projected area `a max(0, n.d)` to direction `d`. Its projection onto the
 //! nine terms is closed-form: `a A_l Y_lm(n)` with the zonal factors of the clamped cosine, pi, 2 pi / 3 and pi / 4.

@@ -1,5 +1,5 @@
 //! Cut picking: a depth-first walk of the octree, near octants first, that ends where clusters are small enough, and rasters
-//! what it ends on (paper section 5, [Chr08] section 3.3).
+//! what it ends on (paper section 5; Christensen 2008, section 3.3).
 
 use crate::cluster::Cluster;
 use crate::frame::Frame;

@@ -1,5 +1,5 @@
 //! Octree to irradiance: picks a cut of the octree for every receiver, rasters it front to back into a hemisphere of
-//! bits that all carry the same cosine weight, and sums what they see (paper section 5, [Chr08] section 3.3 and on).
+//! bits that all carry the same cosine weight, and sums what they see (paper section 5; Christensen 2008, section 3.3 and on).
 //!
 //! The principal type is [`Shader`]; it takes receivers in groups and reads nodes and points through a [`SceneSource`].
 //! This crate knows no files and no shared memory. See `README.md` beside it for the method and where it leaves the paper.
