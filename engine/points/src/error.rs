@@ -70,6 +70,9 @@ pub enum PointsError {
         /// The file.
         path: PathBuf,
     },
+    /// An output file cannot be made.
+    #[error(transparent)]
+    Store(#[from] pbgi_store::StoreError),
     /// The caller stopped it.
     #[error("cancelled")]
     Cancelled,

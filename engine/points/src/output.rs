@@ -1,9 +1,7 @@
-//! The one place where files are made: written beside the target under a temporary name, then renamed over it, so that a
-//! reader never sees half a file and a failure leaves nothing behind.
+//! The one place where files are made: buffered, and published whole or not at all.
 
 use crate::error::PointsError;
-use std::ffi::OsString;
-use std::fs::{self, File};
+use pbgi_store::{AtomicFile, Overwrite};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
@@ -25,29 +23,25 @@ where
 
 /// A file on its way: it appears under its name when it is published, and not at all when it is dropped before.
 pub(crate) struct OutputFile {
-    file: BufWriter<File>,
-    path: PathBuf,
-    temporary: Temporary,
+    file: BufWriter<AtomicFile>,
 }
 
 impl OutputFile {
     pub(crate) fn create(path: &Path) -> Result<Self, PointsError> {
-        let temporary = Temporary::beside(path);
-        let file = File::create(&temporary.path).map_err(PointsError::io("create", path))?;
+        let file = AtomicFile::create(path, Overwrite::Replace)?;
         Ok(Self {
             file: BufWriter::with_capacity(BUFFER_BYTES, file),
-            path: path.to_owned(),
-            temporary,
         })
     }
 
     pub(crate) fn publish(mut self) -> Result<(), PointsError> {
-        self.file.flush().map_err(PointsError::io("write", &self.path))?;
-        self.file
-            .get_ref()
-            .sync_all()
-            .map_err(PointsError::io("write", &self.path))?;
-        self.temporary.publish(&self.path)
+        let path = self.file.get_ref().target().to_owned();
+        self.file.flush().map_err(PointsError::io("write", &path))?;
+        let file = self
+            .file
+            .into_inner()
+            .map_err(|error| PointsError::io("write", &path)(error.into_error()))?;
+        Ok(file.publish()?)
     }
 }
 
@@ -105,41 +99,10 @@ impl From<WriteFailure<image::ImageError>> for PointsError {
     }
 }
 
-/// A file that is deleted unless it is published.
-struct Temporary {
-    path: PathBuf,
-    published: bool,
-}
-
-impl Temporary {
-    fn beside(path: &Path) -> Self {
-        let mut name = path.file_name().map_or_else(OsString::new, OsString::from);
-        name.push(format!(".tmp-{}", std::process::id()));
-        Self {
-            path: path.with_file_name(name),
-            published: false,
-        }
-    }
-
-    fn publish(mut self, path: &Path) -> Result<(), PointsError> {
-        fs::rename(&self.path, path).map_err(PointsError::io("create", path))?;
-        self.published = true;
-        Ok(())
-    }
-}
-
-impl Drop for Temporary {
-    fn drop(&mut self) {
-        if !self.published {
-            // Best effort: the error that brought us here is the one to report.
-            let _ = fs::remove_file(&self.path);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     #[test]
     fn a_failed_write_leaves_the_old_file_and_no_temporary() {
