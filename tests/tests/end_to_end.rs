@@ -39,7 +39,7 @@ fn render_and_the_single_steps_give_the_same_picture() {
     for layer in LAYERS {
         assert_same_values(layer, steps.channel(layer), render.channel(layer));
     }
-    // A point file has other bounds than its mesh, so the octree's cells lie elsewhere.
+    // Through a point file, normals are packed twice: close, not the same to the last bit.
     let cloud = Picture::read(&house.path("cloud.exr"));
     for (layer, most) in [("occlusion.Z", 0.01), ("indirect.G", 0.02)] {
         let off = rms(cloud.channel(layer), render.channel(layer), render.channel("A"));

@@ -1,5 +1,7 @@
 //! Bad input: one clear error that says what, where and what to do, and nothing half-written.
 
+#![allow(clippy::unwrap_used, reason = "tests")]
+
 use pbgi_points::{LayeredImage, Precision};
 use pbgi_tests::{DAEMON, House, Picture, Run, assert_same, flip_bit, page_count, program};
 use std::fs;
