@@ -16,17 +16,22 @@ mod scene;
 
 pub use house::{DAEMON, House, Job, Run, program, signal, wait_for, workspace_root};
 pub use nix::sys::signal::Signal;
-pub use picture::{Picture, relative_rms, rms};
+pub use picture::{Picture, assert_same, assert_same_values, relative_rms, rms};
 pub use scene::{flip_bit, page_count};
 
 use std::path::PathBuf;
 
 /// A file of the shared real-world data, or `None` with a loud word that the test was skipped.
 pub fn shared(path: &str) -> Option<PathBuf> {
-    let file = workspace_root().join("../shared").join(path);
-    if file.metadata().is_ok() {
+    // Beside the workspace, or beside a folder that it lies in.
+    let root = workspace_root();
+    let found = root.ancestors().skip(1).map(|folder| folder.join("shared").join(path));
+    if let Some(file) = found.into_iter().find(|file| file.metadata().is_ok()) {
         return Some(file.canonicalize().unwrap());
     }
-    eprintln!("SKIPPED: {path} is not there (looked for {})", file.display());
+    eprintln!(
+        "SKIPPED: shared/{path} is not there (looked beside {} and upwards)",
+        root.display()
+    );
     None
 }

@@ -58,6 +58,31 @@ impl Picture {
     }
 }
 
+/// Asserts that two pictures have the same size, channels and values, bit for bit; says where they differ first.
+#[track_caller]
+pub fn assert_same(a: &Picture, b: &Picture) {
+    assert_eq!((a.width, a.height), (b.width, b.height));
+    assert!(a.channels.keys().eq(b.channels.keys()), "other channels");
+    for (name, values) in &a.channels {
+        assert_same_values(name, values, b.channel(name));
+    }
+}
+
+/// Asserts that two channels are the same, bit for bit; says how much they differ.
+#[track_caller]
+pub fn assert_same_values(name: &str, a: &[f32], b: &[f32]) {
+    assert_eq!(a.len(), b.len(), "{name}");
+    let pairs = || a.iter().zip(b);
+    let different = pairs().filter(|(a, b)| a.to_bits() != b.to_bits()).count();
+    let most = pairs().map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    let first = pairs().position(|(a, b)| a.to_bits() != b.to_bits());
+    assert!(
+        different == 0,
+        "{name}: {different} of {} values differ by up to {most}, the first at {first:?}",
+        a.len()
+    );
+}
+
 /// Root mean square difference over the pixels where `mask` is above one half.
 pub fn rms(values: &[f32], reference: &[f32], mask: &[f32]) -> f64 {
     let (mut sum, mut count) = (0.0, 0.0);

@@ -1,7 +1,9 @@
 //! Bad input: one clear error that says what, where and what to do, and nothing half-written.
 
+#![allow(clippy::unwrap_used, reason = "tests")]
+
 use pbgi_points::{LayeredImage, Precision};
-use pbgi_tests::{DAEMON, House, Picture, Run, flip_bit, page_count, program};
+use pbgi_tests::{DAEMON, House, Picture, Run, assert_same, flip_bit, page_count, program};
 use std::fs;
 use std::path::Path;
 
@@ -108,9 +110,9 @@ fn page_damaged_after_it_was_read_does_not_matter_until_it_is_read_again() {
         flip_bit(&house.path("demo.pbgi"), "nodes.pages", page);
     }
     house.line(&shade("warm.exr", DAEMON)).ok();
-    assert_eq!(
-        Picture::read(&house.path("before.exr")),
-        Picture::read(&house.path("warm.exr"))
+    assert_same(
+        &Picture::read(&house.path("before.exr")),
+        &Picture::read(&house.path("warm.exr")),
     );
     refused(
         &house,

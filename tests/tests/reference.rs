@@ -1,6 +1,6 @@
 //! Pictures against ground truth: Monte Carlo ray tracing of the same mesh, made without this code.
 
-use pbgi_tests::{House, Picture, relative_rms, rms, shared};
+use pbgi_tests::{House, Picture, assert_same_values, relative_rms, rms, shared};
 
 #[test]
 fn cornell_box_is_close_to_the_ray_traced_reference() {
@@ -38,6 +38,6 @@ fn cornell_box_is_close_to_the_ray_traced_reference() {
     assert!(indirect <= 0.06, "indirect light is off by {indirect}");
     // The maximum distance acts on occlusion and bent normal only.
     for name in colours {
-        assert_eq!(whole.channel(name), near.channel(name), "{name}");
+        assert_same_values(name, whole.channel(name), near.channel(name));
     }
 }
