@@ -4,11 +4,17 @@ use glam::Vec3;
 
 const SCALE: f32 = 32_767.0;
 
-/// Encodes a unit vector.
+/// Encodes a unit vector. Of the two codes that a direction on the map's rim has, it is always the same one, so that
+/// decoding and encoding again changes nothing.
 #[inline]
 pub fn encode(unit: Vec3) -> [i16; 2] {
-    let [x, y] = project(unit);
-    [(x * SCALE).round() as i16, (y * SCALE).round() as i16]
+    const RIM: i16 = SCALE as i16;
+    let [x, y] = project(unit).map(|value| (value * SCALE).round() as i16);
+    match (x.abs() == RIM, y.abs() == RIM) {
+        (true, _) => [x, y.abs()],
+        (_, true) => [x.abs(), y],
+        _ => [x, y],
+    }
 }
 
 /// Decodes to a unit vector; every input is valid.
@@ -42,6 +48,13 @@ mod tests {
             prop_assume!(Vec3::new(x, y, z).length() > 1e-3);
             let unit = Vec3::new(x, y, z).normalize();
             prop_assert!(decode(encode(unit)).distance(unit) < 1e-4);
+        }
+
+        #[test]
+        fn encoding_again_changes_nothing(a: i16, b: i16, rim in 0..5) {
+            let code = match rim { 0 => [32_767, b], 1 => [-32_767, b], 2 => [a, 32_767], 3 => [a, -32_767], _ => [a, b] };
+            let once = encode(decode(code));
+            prop_assert_eq!(encode(decode(once)), once);
         }
 
         #[test]

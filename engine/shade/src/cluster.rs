@@ -30,6 +30,8 @@ const ARC_SLACK_OPPOSED: f32 = 0.03;
 /// Distance in voxel edges, and in radii of a disc, within which an element may be the receiver's own surface.
 const NEAR_VOXELS: f32 = 2.5;
 
+/// Clusters across the maximum distance are refined until they reach this share of it to both sides.
+const RANGE_SHARE: f32 = 0.02;
 /// How far a section reaches beyond a uniform covering with the points' variance, which a few points know only roughly ...
 const REACH_SCALE: f32 = 1.15;
 /// ... and beyond that, in radii.
@@ -47,6 +49,8 @@ pub(crate) struct Cluster {
     pub(crate) covariance: [f32; 6],
     pub(crate) area: f32,
     pub(crate) fill: f32,
+    /// How far it reaches before and behind its centroid, as the receiver sees it.
+    pub(crate) depth: f32,
     /// Root mean square sine between normals and axis.
     spread: f32,
     /// Largest radius of a point, nearly.
@@ -80,8 +84,11 @@ impl Cluster {
             && near
             && (continues_surface(receiver.normal, axis, centroid)
                 || (inside && is_aligned(receiver.normal, axis) && axis.dot(centroid).abs() < 0.08 * edge));
+        let along = quadratic_form(&covariance, centroid.normalize_or_zero()).max(0.0);
         Self {
             centroid,
+            // A uniform segment reaches the square root of three standard deviations.
+            depth: (3.0 * along).sqrt(),
             distance_squared: centroid.length_squared(),
             axis,
             covariance,
@@ -114,6 +121,10 @@ impl Cluster {
     #[inline(always)]
     pub(crate) fn small_enough(&self, settings: &ShadeSettings, leaf: bool) -> bool {
         let area = self.area.min(self.normaliser);
+        let crosses = (self.distance_squared.sqrt() - settings.max_dist).abs() < self.depth;
+        if crosses && !leaf && self.depth > RANGE_SHARE * settings.max_dist {
+            return false;
+        }
         if self.flat {
             let whole = leaf && self.fill >= SECTION_FILL;
             whole || (!self.close && area < settings.max_solid_angle * self.distance_squared)

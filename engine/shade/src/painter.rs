@@ -79,7 +79,8 @@ impl Painter<'_> {
             self.rectangle(cluster, plane)
         };
         let distance = cluster.distance_squared.sqrt();
-        let covered = self.cover(&footprint, 1.0, distance, visit);
+        let weight = self.weight(distance, cluster.depth);
+        let covered = self.cover(&footprint, 1.0, weight, visit);
         if covered.bits > 0 {
             let (even, odd) = cluster.evaluate(cluster.axis);
             let power = |sign: f32| {
@@ -142,7 +143,8 @@ impl Painter<'_> {
         let local = |v| self.frame.local_from_world(v);
         let sides = [(local(u), a), (local(v), b)];
         let footprint = Footprint::rectangle(local(cluster.centroid), local(plane.normal), distance, sides);
-        let covered = self.cover(&footprint, density, distance, visit);
+        let weight = self.weight(distance, cluster.depth);
+        let covered = self.cover(&footprint, density, weight, visit);
         if covered.bits > 0 {
             let power = Vec3::new(even[1] + odd[1], even[2] + odd[2], even[3] + odd[3]).max(Vec3::ZERO);
             let drawn = (4.0 * a * b * density).min(shown).max(1e-30);
@@ -191,7 +193,8 @@ impl Painter<'_> {
         for (normal, distance) in cuts {
             footprint.cut(self.frame, plane, *normal, *distance);
         }
-        let covered = self.cover(&footprint, 1.0, facet.centroid.length(), visit);
+        let weight = self.weight(facet.centroid.length(), facet.radius);
+        let covered = self.cover(&footprint, 1.0, weight, visit);
         if covered.bits > 0 {
             let side = usize::from(facet.normal.dot(facet.centroid) > 0.0);
             self.seen.radiance += facet.power[side] / facet.area * covered.light;
@@ -236,8 +239,7 @@ impl Painter<'_> {
     }
 
     #[inline(always)]
-    fn cover(&mut self, footprint: &Footprint, density: f32, distance: f32, visit: &Visit) -> Covered {
-        let weight = self.weight(distance, visit.half);
+    fn cover(&mut self, footprint: &Footprint, density: f32, weight: f32, visit: &Visit) -> Covered {
         let ink = Ink {
             density,
             weight,
@@ -252,7 +254,7 @@ impl Painter<'_> {
     #[inline(always)]
     fn weight(&self, distance: f32, extent: f32) -> f32 {
         let settings = self.walk.settings;
-        let within = ((settings.max_dist - distance + extent) / (2.0 * extent)).clamp(0.0, 1.0);
+        let within = ((settings.max_dist - distance + extent) / (2.0 * extent).max(f32::MIN_POSITIVE)).clamp(0.0, 1.0);
         if settings.falloff > 0.0 {
             within * (-settings.falloff * distance).exp()
         } else {
