@@ -25,8 +25,6 @@ const ROUND_SHARE: f32 = 0.2;
 const SAME_SURFACE: f32 = 0.7;
 /// How far from an arc through both a receiver and an element may stand, as a sine.
 const ARC_SLACK: f32 = 0.15;
-/// The same where the normals are opposed: a sheet seen from its back, or another surface close by.
-const ARC_SLACK_OPPOSED: f32 = 0.03;
 /// Distance in voxel edges, and in radii of a disc, within which an element may be the receiver's own surface.
 const NEAR_VOXELS: f32 = 2.5;
 
@@ -163,15 +161,12 @@ pub(crate) fn is_aligned(a: Vec3, b: Vec3) -> bool {
 #[inline(always)]
 pub(crate) fn continues_surface(receiver_normal: Vec3, normal: Vec3, center: Vec3) -> bool {
     let facing = normal.dot(receiver_normal);
-    let (normal, slack) = if facing < 0.0 {
-        (-normal, ARC_SLACK_OPPOSED)
-    } else {
-        (normal, ARC_SLACK)
-    };
+    // A sheet may be seen from its back.
+    let normal = if facing < 0.0 { -normal } else { normal };
     let behind = normal.dot(center);
     facing.abs() > SAME_SURFACE
         && behind >= 0.0
-        && (behind + receiver_normal.dot(center)).abs() < slack * center.length()
+        && (behind + receiver_normal.dot(center)).abs() < ARC_SLACK * center.length()
 }
 
 #[inline(always)]
