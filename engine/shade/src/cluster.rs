@@ -28,8 +28,6 @@ const ARC_SLACK: f32 = 0.15;
 /// Distance in voxel edges, and in radii of a disc, within which an element may be the receiver's own surface.
 const NEAR_VOXELS: f32 = 2.5;
 
-/// Clusters across the maximum distance are refined until they reach this share of it to both sides.
-const RANGE_SHARE: f32 = 0.02;
 /// How far a section reaches beyond a uniform covering with the points' variance, which a few points know only roughly ...
 const REACH_SCALE: f32 = 1.15;
 /// ... and beyond that, in radii.
@@ -119,10 +117,6 @@ impl Cluster {
     #[inline(always)]
     pub(crate) fn small_enough(&self, settings: &ShadeSettings, leaf: bool) -> bool {
         let area = self.area.min(self.normaliser);
-        let crosses = (self.distance_squared.sqrt() - settings.max_dist).abs() < self.depth;
-        if crosses && !leaf && self.depth > RANGE_SHARE * settings.max_dist {
-            return false;
-        }
         if self.flat {
             let whole = leaf && self.fill >= SECTION_FILL;
             whole || (!self.close && area < settings.max_solid_angle * self.distance_squared)
