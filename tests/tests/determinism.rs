@@ -34,7 +34,7 @@ fn number_of_workers_does_not_change_a_bit() {
 #[test]
 fn cache_of_a_tenth_of_the_scene_does_not_change_a_bit() {
     let house = House::new();
-    house.furnish(100_000, "64x64");
+    house.furnish(600_000, "64x64");
     house
         .line(&format!(
             "build demo.ply -o small.pbgi --nodes-per-page 64 --points-per-page 128 {DAEMON}"
@@ -45,7 +45,7 @@ fn cache_of_a_tenth_of_the_scene_does_not_change_a_bit() {
     // Two workers at the least memory that holds their frames.
     let (tight, statistics) = shade(&house, "small.pbgi", "--memory 58M --workers 2");
     let number = |name: &str| statistics[name].as_f64().unwrap();
-    assert!(number("reloads") > 1_000.0, "{statistics:#}");
+    assert!(number("reloads") > 100.0, "{statistics:#}");
     assert_eq!(number("redundant_reads"), 0.0);
     assert!(
         number("cache_peak_bytes") * 8.0 < number("out_of_core_bytes"),

@@ -23,6 +23,13 @@ pub(crate) const SECTION_FILL: f32 = 0.7;
 const ROUND_SHARE: f32 = 0.2;
 /// Cosine between normals from which a disc is taken for the receiver's own surface.
 const SAME_SURFACE: f32 = 0.7;
+/// The same for elements that the receiver nearly touches, facing the same way; shading normals lean, and folds turn within
+/// an element.
+const SAME_SHEET: f32 = 0.5;
+/// How far behind an element's plane a receiver on the same surface may lie, as a share of the element's width.
+const SHEET_DEPTH: f32 = 0.15;
+/// The same for a receiver inside the element's voxel, to either side.
+const INSIDE_DEPTH: f32 = 0.08;
 /// How far from an arc through both a receiver and an element may stand, as a sine.
 const ARC_SLACK: f32 = 0.15;
 /// Distance in voxel edges, and in radii of a disc, within which an element may be the receiver's own surface.
@@ -78,8 +85,8 @@ impl Cluster {
         let near = centroid.length_squared() < NEAR_VOXELS * NEAR_VOXELS * edge * edge;
         let own_surface = flat
             && near
-            && (continues_surface(receiver.normal, axis, centroid)
-                || (inside && is_aligned(receiver.normal, axis) && axis.dot(centroid).abs() < 0.08 * edge));
+            && (is_own_surface(receiver.normal, axis, centroid, edge)
+                || (inside && is_aligned(receiver.normal, axis) && axis.dot(centroid).abs() < INSIDE_DEPTH * edge));
         let along = quadratic_form(&covariance, centroid.normalize_or_zero()).max(0.0);
         Self {
             centroid,
@@ -149,18 +156,19 @@ pub(crate) fn is_aligned(a: Vec3, b: Vec3) -> bool {
     a.dot(b).abs() > SAME_SURFACE
 }
 
-/// Whether an element at `center` with `normal` is the receiver's own surface curving away, which only the flatness of the
-/// element lifts above the receiver: the receiver is behind it, and both normals stand on one arc. On a circle the chord
-/// makes equal and opposite angles with the normals at its ends.
+/// Whether a near element at `center` with `normal`, `size` wide, is the receiver's own surface, which only the flatness of
+/// the element lifts above the receiver: the receiver is behind it, and either close to its plane for its size, or both
+/// normals stand on one arc. On a circle the chord makes equal and opposite angles with the normals at its ends.
 #[inline(always)]
-pub(crate) fn continues_surface(receiver_normal: Vec3, normal: Vec3, center: Vec3) -> bool {
+pub(crate) fn is_own_surface(receiver_normal: Vec3, normal: Vec3, center: Vec3, size: f32) -> bool {
     let facing = normal.dot(receiver_normal);
     // A sheet may be seen from its back.
     let normal = if facing < 0.0 { -normal } else { normal };
     let behind = normal.dot(center);
-    facing.abs() > SAME_SURFACE
-        && behind >= 0.0
-        && (behind + receiver_normal.dot(center)).abs() < ARC_SLACK * center.length()
+    let on_arc =
+        facing.abs() > SAME_SURFACE && (behind + receiver_normal.dot(center)).abs() < ARC_SLACK * center.length();
+    let in_depth = facing > SAME_SHEET && behind < SHEET_DEPTH * size;
+    behind >= 0.0 && (on_arc || in_depth)
 }
 
 #[inline(always)]

@@ -1,6 +1,6 @@
 //! Draws the elements of a cut into the raster and sums what they add.
 
-use crate::cluster::{Cluster, SECTION_FILL, continues_surface, is_aligned, rectangle_of};
+use crate::cluster::{Cluster, SECTION_FILL, is_aligned, is_own_surface, rectangle_of};
 use crate::cut::{Seen, Visit, Walk};
 use crate::facet::{Facet, facets};
 use crate::footprint::{Footprint, Plane};
@@ -16,6 +16,8 @@ const TWO_SHEETS_FILL: f32 = 1.6;
 /// Discs are drawn this much wider than their area says, because round ones of equal area leave gaps on a surface.
 const DISC_SCALE: f32 = 1.4;
 const NEAR_RADII: f32 = 6.0;
+/// Width of what a disc or facet stands for, in radii, when asked whether a receiver lies on it.
+const DISC_WIDTH: f32 = 4.0;
 /// Distance from a plane, as a share of half a voxel's edge or of a disc's radius, that is no distance.
 const TOUCH: f32 = 1e-3;
 /// Share of covered bits from which it pays to ask whether a voxel is hidden.
@@ -186,7 +188,7 @@ impl Painter<'_> {
         let plane = Plane::through(facet.centroid, facet.normal, TOUCH * visit.half);
         let touched =
             is_aligned(receiver.normal, facet.normal) && plane.distance < self.walk.settings.bias * facet.radius;
-        if touched || continues_surface(receiver.normal, facet.normal, facet.centroid) {
+        if touched || is_own_surface(receiver.normal, facet.normal, facet.centroid, DISC_WIDTH * facet.radius) {
             return;
         }
         let mut footprint = Footprint::section(self.frame, facet.section_box(visit), plane);
@@ -210,7 +212,7 @@ impl Painter<'_> {
         if distance < NEAR_RADII * point.radius {
             let touched =
                 is_aligned(receiver.normal, normal) && plane.distance < self.walk.settings.bias * point.radius;
-            if touched || continues_surface(receiver.normal, normal, center) {
+            if touched || is_own_surface(receiver.normal, normal, center, DISC_WIDTH * point.radius) {
                 return;
             }
         }
