@@ -2,7 +2,7 @@
 
 use crate::convert;
 use crate::error::{ClientError, Refusal};
-use crate::job::{BuildJob, DaemonStatus, Job, ShadeJob};
+use crate::job::{BuildJob, DaemonStatus, Job, JobOptions, ShadeJob};
 use hyper_util::rt::TokioIo;
 use pbgi_core::SceneInfo;
 use pbgi_proto::v1;
@@ -81,21 +81,26 @@ impl Client {
     ///
     /// # Errors
     /// The daemon's refusal, or a lost connection.
-    pub async fn submit_build(&self, id: &str, job: &BuildJob) -> Result<Job, ClientError> {
+    pub async fn submit_build(&self, id: &str, job: &BuildJob, options: &JobOptions) -> Result<Job, ClientError> {
         let task = convert::build_task(job).map(v1::submit_job_request::Task::Build);
-        self.submit(id, task).await
+        self.submit(id, task, options).await
     }
 
     /// Submits a shading job, as [`Self::submit_build`].
     ///
     /// # Errors
     /// The daemon's refusal, or a lost connection.
-    pub async fn submit_shade(&self, id: &str, job: &ShadeJob) -> Result<Job, ClientError> {
+    pub async fn submit_shade(&self, id: &str, job: &ShadeJob, options: &JobOptions) -> Result<Job, ClientError> {
         let task = convert::shade_task(job).map(v1::submit_job_request::Task::Shade);
-        self.submit(id, task).await
+        self.submit(id, task, options).await
     }
 
-    async fn submit(&self, id: &str, task: Result<v1::submit_job_request::Task, String>) -> Result<Job, ClientError> {
+    async fn submit(
+        &self,
+        id: &str,
+        task: Result<v1::submit_job_request::Task, String>,
+        options: &JobOptions,
+    ) -> Result<Job, ClientError> {
         let wish = Wish::new(format!("submit job {id:?}"), REQUEST_SECS);
         let task = task.map_err(|message| ClientError::Refused {
             action: wish.action.clone(),
@@ -105,6 +110,8 @@ impl Client {
         let request = v1::SubmitJobRequest {
             job_id: id.to_owned(),
             task: Some(task),
+            options: Some(convert::job_options(options)),
+            attach: options.attach,
         };
         let answer = self.jobs().submit_job(wish.request(request)).await;
         wish.job(answer)
@@ -127,7 +134,10 @@ impl Client {
     /// No such job, or a lost connection.
     pub async fn watch(&self, id: &str, mut observe: impl FnMut(&Job)) -> Result<Job, ClientError> {
         let wish = Wish::new(format!("watch job {id:?}"), REQUEST_SECS);
-        let request = v1::WatchJobRequest { job_id: id.to_owned() };
+        let request = v1::WatchJobRequest {
+            job_id: id.to_owned(),
+            cancel_on_disconnect: false,
+        };
         // No deadline: a job may take days.
         let answer = self.jobs().watch_job(Request::new(request)).await;
         let mut stream = answer.map_err(|status| wish.failed(&status))?.into_inner();
@@ -148,10 +158,45 @@ impl Client {
     ///
     /// # Errors
     /// No such job, or a lost connection.
-    pub async fn cancel(&self, id: &str) -> Result<Job, ClientError> {
+    pub async fn cancel(&self, id: &str, reason: &str) -> Result<Job, ClientError> {
         let wish = Wish::new(format!("cancel job {id:?}"), REQUEST_SECS);
-        let request = v1::CancelJobRequest { job_id: id.to_owned() };
+        let (job_id, reason) = (id.to_owned(), reason.to_owned());
+        let request = v1::CancelJobRequest { job_id, reason };
         let answer = self.jobs().cancel_job(wish.request(request)).await;
+        wish.job(answer)
+    }
+
+    /// Lets a job rest: its leased tiles are finished, and no more.
+    ///
+    /// # Errors
+    /// No such job, one that cannot rest any more, or a lost connection.
+    pub async fn pause(&self, id: &str, reason: &str) -> Result<Job, ClientError> {
+        let wish = Wish::new(format!("pause job {id:?}"), REQUEST_SECS);
+        let (job_id, reason) = (id.to_owned(), reason.to_owned());
+        let request = v1::PauseJobRequest { job_id, reason };
+        let answer = self.jobs().pause_job(wish.request(request)).await;
+        wish.job(answer)
+    }
+
+    /// Lets a paused job go on.
+    ///
+    /// # Errors
+    /// No such job, or a lost connection.
+    pub async fn resume(&self, id: &str) -> Result<Job, ClientError> {
+        let wish = Wish::new(format!("resume job {id:?}"), REQUEST_SECS);
+        let request = v1::ResumeJobRequest { job_id: id.to_owned() };
+        let answer = self.jobs().resume_job(wish.request(request)).await;
+        wish.job(answer)
+    }
+
+    /// Puts a job that failed or was cancelled back in line.
+    ///
+    /// # Errors
+    /// No such job, one whose output another job makes, or a lost connection.
+    pub async fn retry(&self, id: &str) -> Result<Job, ClientError> {
+        let wish = Wish::new(format!("retry job {id:?}"), REQUEST_SECS);
+        let request = v1::RetryJobRequest { job_id: id.to_owned() };
+        let answer = self.jobs().retry_job(wish.request(request)).await;
         wish.job(answer)
     }
 
@@ -161,7 +206,10 @@ impl Client {
     /// A lost connection.
     pub async fn list(&self) -> Result<Vec<Job>, ClientError> {
         let wish = Wish::new("list the jobs", REQUEST_SECS);
-        let answer = self.jobs().list_jobs(wish.request(v1::ListJobsRequest {})).await;
+        let answer = self
+            .jobs()
+            .list_jobs(wish.request(v1::ListJobsRequest::default()))
+            .await;
         let list = answer.map_err(|status| wish.failed(&status))?.into_inner();
         let jobs = list.jobs.into_iter().map(convert::job).collect::<Result<_, _>>();
         jobs.map_err(|fault| wish.malformed(fault))

@@ -1,6 +1,8 @@
 //! Wire types to plain types and back.
 
-use crate::job::{BuildJob, DaemonStatus, Job, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
+use crate::job::{
+    BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
+};
 use pbgi_core::{Bounds, BuildId, BuildSettings, NodeIndex, Quantizer, SceneInfo, ShadeSettings, Statistics};
 use pbgi_points::Density;
 use pbgi_proto::v1;
@@ -29,6 +31,16 @@ pub(crate) fn shade_task(job: &ShadeJob) -> Result<v1::ShadeTask, String> {
         environment: job.environment.as_deref().map(text).transpose()?.unwrap_or_default(),
         workers: job.workers.unwrap_or(0),
     })
+}
+
+pub(crate) fn job_options(options: &JobOptions) -> v1::JobOptions {
+    v1::JobOptions {
+        user: options.user.clone(),
+        labels: options.labels.clone().into_iter().collect(),
+        priority: options.priority,
+        after: options.after.clone(),
+        paused: options.paused,
+    }
 }
 
 /// A path as the wire carries it.
@@ -67,6 +79,11 @@ pub(crate) fn job(wire: v1::Job) -> Result<Job, String> {
         v1::JobState::Cancelled => JobState::Cancelled,
         v1::JobState::Unspecified => return Err(format!("job state {}", wire.state)),
     };
+    let options = wire.options.unwrap_or_default();
+    let event = |event: v1::JobEvent| JobEvent {
+        unix_millis: event.unix_millis,
+        text: event.text,
+    };
     Ok(Job {
         id: wire.job_id,
         state,
@@ -76,6 +93,15 @@ pub(crate) fn job(wire: v1::Job) -> Result<Job, String> {
         error: wire.error,
         statistics: statistics(wire.statistics.unwrap_or_default()),
         title: wire.title,
+        options: JobOptions {
+            user: options.user,
+            labels: options.labels.into_iter().collect(),
+            priority: options.priority,
+            after: options.after,
+            paused: options.paused,
+            attach: false,
+        },
+        history: wire.history.into_iter().map(event).collect(),
     })
 }
 

@@ -2,6 +2,7 @@
 
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
 use pbgi_points::Density;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Points or meshes in, a scene directory out.
@@ -36,6 +37,32 @@ pub struct ShadeJob {
     pub environment: Option<PathBuf>,
     /// Most workers for this job; `None` for all.
     pub workers: Option<u32>,
+}
+
+/// What is wanted beside the task.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct JobOptions {
+    /// For whom; empty for the calling user.
+    pub user: String,
+    /// Free words: show, shot, department.
+    pub labels: BTreeMap<String, String>,
+    /// Higher ones go first.
+    pub priority: i32,
+    /// Jobs that must succeed first.
+    pub after: Vec<String>,
+    /// Whether it waits to be resumed.
+    pub paused: bool,
+    /// Whether an unfinished job with the same task, under whatever id, will do.
+    pub attach: bool,
+}
+
+/// A line of a job's history.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct JobEvent {
+    /// Milliseconds since the Unix epoch.
+    pub unix_millis: i64,
+    /// What happened.
+    pub text: String,
 }
 
 /// Where a job stands.
@@ -90,6 +117,10 @@ pub struct Job {
     pub statistics: Statistics,
     /// What the job does, for people.
     pub title: String,
+    /// What was wanted beside the task.
+    pub options: JobOptions,
+    /// What happened to it, oldest first.
+    pub history: Vec<JobEvent>,
 }
 
 /// The daemon as it reports itself.

@@ -10,6 +10,7 @@ use crate::rpc;
 use crate::scheduler::{Death, Seat};
 use crate::state::StateDir;
 use crate::supervisor::{Handle, Nursery, Plan, Supervisor, WorkerBirth};
+use crate::table::JobTable;
 use pbgi_cache::{CacheOwner, Segment};
 use pbgi_store::{OsVolume, sweep_scratch};
 use std::fs;
@@ -108,7 +109,9 @@ async fn run_daemon(
     state.note_segment(&name)?;
     let segment = Segment::create(&name, &config.layout).inspect_err(|_| state.forget_segment())?;
     let cache = Arc::new(CacheOwner::new(segment));
-    let (dispatcher, supervisor) = start(config, cache)?;
+    let (table, rows) = JobTable::open(state.path()).inspect_err(|_| unlink(&name, state))?;
+    let (dispatcher, supervisor) = start(config, cache, Arc::new(table)).inspect_err(|_| unlink(&name, state))?;
+    dispatcher.restore(rows, rpc::stored_request);
     let (ending, ended) = watch::channel(false);
     let servers = [
         tokio::spawn(rpc::serve_jobs(listeners.jobs.0, dispatcher.clone(), ended.clone())),
@@ -135,12 +138,19 @@ async fn run_daemon(
         disconnect(server).await;
     }
     // Others may still hold the segment's owner for a moment: its name goes now.
-    if let Err(error) = Segment::unlink(&name) {
+    unlink(&name, state);
+    if let Ok(Err(error)) = dispatcher.table.ticket().await {
+        tracing::error!(error, "the last changes of jobs are lost");
+    }
+    tracing::info!("stopped");
+    Ok(())
+}
+
+fn unlink(name: &str, state: &StateDir) {
+    if let Err(error) = Segment::unlink(name) {
         tracing::error!(%error, "cannot remove the segment");
     }
     state.forget_segment();
-    tracing::info!("stopped");
-    Ok(())
 }
 
 /// Cleans up after a daemon that died.
@@ -161,7 +171,11 @@ fn sweep(config: &Config, state: &StateDir) -> Result<(), ServerError> {
 }
 
 /// Starts the supervisor and, through it, the workers.
-fn start(config: &Config, cache: Arc<CacheOwner>) -> Result<(Arc<Dispatcher>, Handle), ServerError> {
+fn start(
+    config: &Config,
+    cache: Arc<CacheOwner>,
+    table: Arc<JobTable>,
+) -> Result<(Arc<Dispatcher>, Handle), ServerError> {
     let options = &config.options;
     let plan = Plan {
         workers: options.workers as u8,
@@ -178,6 +192,7 @@ fn start(config: &Config, cache: Arc<CacheOwner>) -> Result<(Arc<Dispatcher>, Ha
             cache.clone(),
             mounts.clone(),
             supervisor.clone(),
+            table,
             runtime,
         );
         let dispatcher = made.insert(Arc::new(dispatcher)).clone();

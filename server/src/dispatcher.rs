@@ -1,12 +1,13 @@
 //! Where the scheduler meets the world: holds the jobs, carries out what the scheduler says, and answers workers and clients.
 //!
 //! Everything happens under one lock, briefly: what takes time is spawned. Entry points for workers are here, for clients in
-//! `clients`, for the daemon's clock in `upkeep`.
+//! `clients`, for the daemon's clock in `upkeep`, for what outlives the daemon in `durable`.
 
 mod clients;
+mod durable;
 mod upkeep;
 
-pub use clients::DaemonStatus;
+pub use clients::{DaemonStatus, Submission};
 
 use crate::config::Config;
 use crate::error::{JobError, JobErrorKind};
@@ -17,9 +18,10 @@ use crate::mounts::Mounts;
 use crate::scheduler::{Death, Effect, End, Event, JobNo, LeaseId, Scheduler, Seat};
 use crate::shade_job::{self, Counters, Shading};
 use crate::supervisor::{Handle, WorkerBirth};
+use crate::table::JobTable;
 use pbgi_cache::CacheOwner;
 use pbgi_core::{Environment, MountId, SceneInfo, ShadeSettings};
-use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
@@ -32,6 +34,7 @@ pub struct Dispatcher {
     pub(crate) cache: Arc<CacheOwner>,
     pub(crate) mounts: Arc<Mounts>,
     pub(crate) supervisor: Handle,
+    pub(crate) table: Arc<JobTable>,
     /// Mebibytes of the work share that are free.
     pub(crate) work_memory: Arc<Semaphore>,
     /// One picture is read at a time: how large it is shows only then.
@@ -50,8 +53,10 @@ struct State {
     names: HashMap<String, JobNo>,
     /// Ended jobs, oldest first.
     ended: VecDeque<JobNo>,
+    /// Failed jobs whose tiles are kept, oldest first.
+    failed: VecDeque<JobNo>,
     /// Outputs of jobs that have not ended.
-    outputs: HashSet<PathBuf>,
+    outputs: HashMap<PathBuf, JobNo>,
     seats: Vec<Option<Sitting>>,
     build_pids: HashMap<JobNo, u32>,
     number_last: u64,
@@ -63,6 +68,7 @@ struct State {
 /// A job, and what it holds while it runs.
 struct Record {
     request: Arc<Request>,
+    kept: durable::Kept,
     status: watch::Sender<JobStatus>,
     abort: watch::Sender<bool>,
     span: Span,
@@ -133,6 +139,7 @@ impl Dispatcher {
         cache: Arc<CacheOwner>,
         mounts: Arc<Mounts>,
         supervisor: Handle,
+        table: Arc<JobTable>,
         runtime: tokio::runtime::Handle,
     ) -> Self {
         let state = State {
@@ -140,7 +147,8 @@ impl Dispatcher {
             jobs: BTreeMap::new(),
             names: HashMap::new(),
             ended: VecDeque::new(),
-            outputs: HashSet::new(),
+            failed: VecDeque::new(),
+            outputs: HashMap::new(),
             seats: (0..config.options.workers).map(|_| None).collect(),
             build_pids: HashMap::new(),
             number_last: 0,
@@ -155,6 +163,7 @@ impl Dispatcher {
             cache,
             mounts,
             supervisor,
+            table,
             runtime,
             wake: Notify::new(),
             stop: watch::Sender::new(false),
@@ -190,10 +199,11 @@ impl Dispatcher {
                 }
                 Effect::Accept { job, tile } => {
                     if let Some((values, counters)) = result.take() {
-                        accept(state, job, tile, &values, &counters);
+                        self.accept(state, job, tile, values, &counters);
                     }
                     answer = Some(effect);
                 }
+                Effect::Park(job) => self.park(state, job),
                 Effect::Write(job) => self.write(state, job),
                 Effect::Ended { job, end } => self.ended(state, job, end),
                 Effect::Kill(seat) => self.supervisor.kill(seat),
@@ -208,9 +218,12 @@ impl Dispatcher {
         let Some(record) = state.jobs.get(&job) else { return };
         record.status.send_modify(|status| {
             status.state = JobState::Running;
-            status.stage = "reading";
+            status.stage = "reading".into();
+            status.note("started");
         });
+        self.save(job, record);
         let (request, abort) = (record.request.clone(), record.abort.subscribe());
+        let fingerprint = record.kept.fingerprint.clone();
         let this = self.clone();
         let run = async move {
             match &*request {
@@ -218,7 +231,7 @@ impl Dispatcher {
                     let outcome = crate::builder::run(&this, job, task, abort).await;
                     this.finished(job, outcome);
                 }
-                Request::Shade(task) => match shade_job::prepare(&this, job, task, abort).await {
+                Request::Shade(task) => match shade_job::prepare(&this, job, task, fingerprint, abort).await {
                     Ok(shading) => this.prepared(job, shading),
                     Err(error) => this.finished(job, Err(error)),
                 },
@@ -230,19 +243,24 @@ impl Dispatcher {
     fn prepared(self: &Arc<Self>, job: JobNo, shading: Shading) {
         let mut state = self.lock();
         let Some(record) = state.jobs.get_mut(&job) else { return };
-        let tiles = shading.frame.tiles();
+        let (tiles, done) = (shading.tiles_left.clone(), shading.tiles_stored);
         record.status.send_modify(|status| {
-            status.stage = "shading";
-            status.total = tiles.len() as u64;
+            status.stage = "shading".into();
+            (status.done, status.total) = (done, done + tiles.len() as u64);
+            if done > 0 {
+                status.note(format!("goes on with {done} of {} tiles done", status.total));
+            }
         });
+        record.kept.fingerprint = Some(shading.fingerprint.clone());
         record.shading = Some(Box::new(shading));
+        self.save(job, record);
         self.dispatch(&mut state, Event::Prepared { job, tiles }, None);
     }
 
     fn write(self: &Arc<Self>, state: &mut State, job: JobNo) {
         let Some(record) = state.jobs.get_mut(&job) else { return };
         let Some(shading) = record.shading.take() else { return };
-        record.status.send_modify(|status| status.stage = "writing");
+        record.status.send_modify(|status| status.stage = "writing".into());
         let (request, abort) = (record.request.clone(), record.abort.subscribe());
         let this = self.clone();
         let run = async move {
@@ -265,33 +283,64 @@ impl Dispatcher {
         self.dispatch(&mut state, Event::Finished { job, outcome }, None);
     }
 
+    /// A paused job gives its picture back; its finished tiles wait in the table.
+    fn park(&self, state: &mut State, job: JobNo) {
+        let Some(record) = state.jobs.get_mut(&job) else { return };
+        record.shading = None;
+        record.status.send_modify(|status| {
+            status.state = JobState::Queued;
+            status.stage = "paused".into();
+        });
+        self.save(job, record);
+    }
+
     fn ended(&self, state: &mut State, job: JobNo, end: End) {
         self.cache.end_job(job.0);
         state.active = Instant::now();
+        let unmet = match &end {
+            End::Unmet(before) => state.jobs.get(before).map(|record| record.status.borrow().id.clone()),
+            _ => None,
+        };
         let Some(record) = state.jobs.get_mut(&job) else { return };
         record.shading = None;
+        if end == End::Suspended {
+            record.status.send_modify(|status| {
+                status.state = JobState::Queued;
+                status.stage = "waiting for the next daemon".into();
+                status.suspended = true;
+                status.note("suspended: the daemon stopped");
+            });
+            self.save(job, record);
+            return;
+        }
         state.outputs.remove(record.request.output());
-        record.span.in_scope(|| match &end {
-            End::Succeeded => tracing::info!("job succeeded"),
-            End::Cancelled => tracing::info!("job cancelled"),
-            End::Failed(error) => tracing::error!(error, "job failed"),
+        let (job_state, error) = match end {
+            End::Succeeded => (JobState::Succeeded, String::new()),
+            End::Cancelled => (JobState::Cancelled, String::new()),
+            End::Failed(error) => (JobState::Failed, error),
+            End::Unmet(_) | End::Suspended => {
+                let before = unmet.unwrap_or_default();
+                (
+                    JobState::Failed,
+                    format!("job {before:?}, which it comes after, did not succeed"),
+                )
+            }
+        };
+        record.span.in_scope(|| match job_state {
+            JobState::Failed => tracing::error!(error, "job failed"),
+            _ => tracing::info!(state = ?job_state, "job ended"),
         });
         record.status.send_modify(|status| {
-            status.stage = "";
-            (status.state, status.error) = match end {
-                End::Succeeded => (JobState::Succeeded, String::new()),
-                End::Cancelled => (JobState::Cancelled, String::new()),
-                End::Failed(error) => (JobState::Failed, error),
-            };
+            status.stage = "".into();
+            status.note(match job_state {
+                JobState::Succeeded => "succeeded".to_owned(),
+                JobState::Cancelled => "cancelled".to_owned(),
+                _ => format!("failed: {error}"),
+            });
+            (status.state, status.error) = (job_state, error);
         });
-        state.ended.push_back(job);
-        while state.ended.len() > limits::JOBS_ENDED_MAX {
-            let Some(oldest) = state.ended.pop_front() else { return };
-            if let Some(record) = state.jobs.remove(&oldest) {
-                let name = record.status.borrow().id.clone();
-                state.names.remove(&name);
-            }
-        }
+        self.save(job, record);
+        self.retire(state, job, job_state);
     }
 
     /// A worker was started.
@@ -308,8 +357,9 @@ impl Dispatcher {
         let mut state = self.lock();
         if let Some(sitting) = state.seats.get_mut(usize::from(seat.slot))
             && sitting.as_ref().is_some_and(|sitting| sitting.birth.seat == seat)
+            && let Some(work) = sitting.take().and_then(|sitting| sitting.work)
         {
-            *sitting = None;
+            state.note(work.job, format!("tile {}: its worker died ({death:?})", work.tile));
         }
         self.dispatch(&mut state, Event::WorkerGone { seat, death }, None);
     }
@@ -417,6 +467,9 @@ impl Dispatcher {
                 }
             }
         }
+        if let (Some(text), Some(work)) = (&failure, &work) {
+            state.note(work.job, format!("tile {} failed: {text}", work.tile));
+        }
         let answer = self.dispatch(&mut state, Event::Complete { seat, lease, failure }, result);
         matches!(answer, Some(Effect::Accept { .. }))
     }
@@ -450,13 +503,17 @@ impl Dispatcher {
     }
 }
 
-fn accept(state: &mut State, job: JobNo, tile: u32, values: &[u8], counters: &Counters) {
-    let Some(record) = state.jobs.get_mut(&job) else { return };
-    if let Some(shading) = &mut record.shading {
-        shading.frame.fill(tile, values);
-        shading.counters.add(counters);
+impl State {
+    /// Adds a line to a job's history.
+    fn note(&self, job: JobNo, text: String) {
+        if let Some(record) = self
+            .jobs
+            .get(&job)
+            .filter(|record| !record.status.borrow().state.ended())
+        {
+            record.status.send_modify(|status| status.note(text));
+        }
     }
-    record.status.send_modify(|status| status.done += 1);
 }
 
 /// Compares in a time that does not tell where the difference is.

@@ -51,6 +51,14 @@ pub enum ServerError {
         /// The system's answer.
         source: io::Error,
     },
+    /// The job table cannot be used.
+    #[error("cannot use the job table: {reason}; move it away to start without the jobs in it, at {}", .path.display())]
+    Table {
+        /// Where.
+        path: PathBuf,
+        /// Why not.
+        reason: String,
+    },
     /// The page cache cannot be set up.
     #[error(transparent)]
     Cache(#[from] CacheError),

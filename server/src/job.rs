@@ -5,6 +5,8 @@ use crate::limits;
 use crate::scheduler::{JobNo, Kind};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 
 /// How densely meshes are sampled.
@@ -161,8 +163,71 @@ pub fn check_job_id(id: &str) -> Result<(), JobError> {
     Ok(())
 }
 
+/// What is wanted beside the task itself.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobOptions {
+    /// For whom.
+    pub user: String,
+    /// Free words.
+    pub labels: BTreeMap<String, String>,
+    /// Higher ones go first.
+    pub priority: i32,
+    /// Names of jobs that must succeed first.
+    pub after: Vec<String>,
+    /// Whether it rests.
+    pub paused: bool,
+}
+
+impl JobOptions {
+    /// Checks lengths and ranges.
+    ///
+    /// # Errors
+    /// [`JobErrorKind::Invalid`], naming the field.
+    pub fn validate(&self) -> Result<(), JobError> {
+        let max = limits::LABEL_CHARS_MAX;
+        let words = self.labels.iter().flat_map(|(key, value)| [key, value]);
+        if words
+            .chain([&self.user])
+            .any(|word| word.chars().count() > max || word.chars().any(char::is_control))
+        {
+            return Err(JobError::invalid(format!(
+                "user and labels must be at most {max} characters each, none of them control characters"
+            )));
+        }
+        if self.labels.len() > limits::LABELS_MAX || self.labels.contains_key("") {
+            let (count, max) = (self.labels.len(), limits::LABELS_MAX);
+            return Err(JobError::invalid(format!(
+                "{count} labels, at most {max} with names are taken"
+            )));
+        }
+        if self.priority.abs() > limits::PRIORITY_MAX {
+            let (priority, max) = (self.priority, limits::PRIORITY_MAX);
+            return Err(JobError::invalid(format!(
+                "priority is {priority}, must be from -{max} to {max}"
+            )));
+        }
+        if self.after.len() > limits::AFTER_MAX {
+            let (count, max) = (self.after.len(), limits::AFTER_MAX);
+            return Err(JobError::invalid(format!(
+                "comes after {count} jobs, at most {max} are taken"
+            )));
+        }
+        self.after.iter().try_for_each(|id| check_job_id(id))
+    }
+}
+
+/// A line of a job's history.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobEvent {
+    /// Milliseconds since the Unix epoch.
+    pub unix_millis: i64,
+    /// What happened.
+    pub text: String,
+}
+
 /// Where a job is in its life.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum JobState {
     /// Waits.
     Queued,
@@ -183,8 +248,8 @@ impl JobState {
     }
 }
 
-/// What can be told about a job at a moment.
-#[derive(Clone, Debug, PartialEq)]
+/// What can be told about a job at a moment, and what is kept of it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct JobStatus {
     /// The client's name for it.
     pub id: String,
@@ -193,7 +258,7 @@ pub struct JobStatus {
     /// Where it is.
     pub state: JobState,
     /// What it is doing, for people.
-    pub stage: &'static str,
+    pub stage: Cow<'static, str>,
     /// Units done.
     pub done: u64,
     /// Units in all; 0 while unknown.
@@ -204,6 +269,25 @@ pub struct JobStatus {
     pub statistics: Statistics,
     /// For people.
     pub title: String,
+    /// What is wanted beside the task.
+    pub options: JobOptions,
+    /// What happened to it, oldest first.
+    pub history: VecDeque<JobEvent>,
+    /// The daemon stops, and the next one goes on with it.
+    #[serde(skip)]
+    pub suspended: bool,
+}
+
+impl JobStatus {
+    /// Adds a line to the history; the oldest make room.
+    pub fn note(&mut self, text: impl Into<String>) {
+        if self.history.len() >= limits::HISTORY_MAX {
+            // The first tells when it was submitted.
+            self.history.remove(1);
+        }
+        let (unix_millis, text) = (crate::telemetry::unix_millis(), text.into());
+        self.history.push_back(JobEvent { unix_millis, text });
+    }
 }
 
 /// The error for a job that is not there.

@@ -26,6 +26,8 @@ pub mod scheduler;
 pub mod shade_job;
 pub mod state;
 pub mod supervisor;
+pub mod table;
+pub mod telemetry;
 
 pub use config::{Config, Options};
 pub use daemon::{Listeners, Stop, run};

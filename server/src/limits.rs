@@ -8,6 +8,26 @@ pub const JOBS_QUEUED_MAX: usize = 10_000;
 pub const JOBS_ENDED_MAX: usize = 1_000;
 /// Characters of a job's name.
 pub const JOB_ID_CHARS_MAX: usize = 128;
+/// Failed jobs whose finished tiles are kept for a retry.
+pub const FAILED_JOBS_KEPT_MAX: usize = 16;
+/// Times that a job may run when the daemon dies, before it is taken for the reason.
+pub const DAEMON_DEATHS_MAX: u32 = 3;
+/// Labels of a job.
+pub const LABELS_MAX: usize = 16;
+/// Characters of a user's name, a label's name and a label.
+pub const LABEL_CHARS_MAX: usize = 128;
+/// Largest and, negated, smallest priority.
+pub const PRIORITY_MAX: i32 = 1_000;
+/// Jobs that a job may come after.
+pub const AFTER_MAX: usize = 64;
+/// Lines of a job's history.
+pub const HISTORY_MAX: usize = 48;
+/// Bytes of finished tiles that may wait to be stored; beyond, tiles are not stored, and shaded again after a crash.
+pub const TILES_UNSTORED_BYTES_MAX: usize = 8 << 20;
+/// Memory of the job table's own cache.
+pub const TABLE_CACHE_BYTES: usize = 4 << 20;
+/// Unused bytes in the job table's file above which it is compacted when the daemon starts.
+pub const TABLE_SLACK_BYTES_MAX: u64 = 64 << 20;
 /// Input files of a build.
 pub const BUILD_INPUTS_MAX: usize = 1_024;
 /// Bytes of a path.

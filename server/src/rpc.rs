@@ -9,9 +9,11 @@ mod queue;
 pub mod status;
 
 use crate::dispatcher::Dispatcher;
-use crate::error::ServerError;
+use crate::error::{JobError, ServerError};
+use crate::job::Request;
 use crate::limits;
 use accept::{check_peer, connections};
+use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_server::DaemonServiceServer;
 use pbgi_proto::v1::job_service_server::JobServiceServer;
 use pbgi_proto::v1::queue_service_server::QueueServiceServer;
@@ -129,6 +131,16 @@ pub async fn serve_queue(
         })
         .await
         .map_err(failed)
+}
+
+/// A request as it was kept from the wire.
+///
+/// # Errors
+/// It is of another version.
+pub fn stored_request(wire: &[u8]) -> Result<Request, JobError> {
+    let request = <v1::SubmitJobRequest as prost::Message>::decode(wire);
+    let request = request.map_err(|error| JobError::invalid(error.to_string()))?;
+    convert::request(request.task)
 }
 
 fn failed(error: tonic::transport::Error) -> ServerError {

@@ -5,7 +5,7 @@ use crate::error::JobError;
 use crate::framebuffer::Framebuffer;
 use crate::job::ShadeTask;
 use crate::limits;
-use crate::mounts::{Mounted, Mounts};
+use crate::mounts::Mounted;
 use crate::output;
 use crate::scheduler::JobNo;
 use pbgi_cache::JobCounters;
@@ -13,6 +13,9 @@ use pbgi_core::limits::IMAGE_PIXELS_MAX;
 use pbgi_core::{Environment, Statistics};
 use pbgi_points::{GBuffer, read_environment};
 use pbgi_store::StoreError;
+use std::collections::HashSet;
+use std::os::unix::fs::MetadataExt;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::{OwnedSemaphorePermit, watch};
@@ -27,8 +30,14 @@ pub struct Shading {
     pub environment: Option<Arc<Environment>>,
     /// What the tiles took so far.
     pub counters: Counters,
+    /// Tiles to be shaded, along a Z-curve.
+    pub tiles_left: Vec<u32>,
+    /// Tiles that a former run had stored, in the picture already.
+    pub tiles_stored: u64,
+    /// Tells what the tiles are made from: another scene, G-buffer or environment has another one.
+    pub fingerprint: String,
     started: Instant,
-    _memory: OwnedSemaphorePermit,
+    memory: Option<OwnedSemaphorePermit>,
 }
 
 /// What tiles took, as workers tell.
@@ -57,19 +66,46 @@ pub struct Counters {
 }
 
 impl Counters {
+    const COUNT: usize = 10;
+
+    fn fields(&mut self) -> [&mut u64; Self::COUNT] {
+        [
+            &mut self.receivers,
+            &mut self.cut_elements,
+            &mut self.nodes_visited,
+            &mut self.traversal_bytes,
+            &mut self.local_hits,
+            &mut self.shared_hits,
+            &mut self.shared_hits_other_job,
+            &mut self.cache_misses,
+            &mut self.cpu_nanos,
+            &mut self.io_nanos,
+        ]
+    }
+
+    /// As they are stored before a tile's values.
+    pub fn to_bytes(mut self) -> Vec<u8> {
+        self.fields()
+            .into_iter()
+            .flat_map(|field| field.to_le_bytes())
+            .collect()
+    }
+
+    /// What [`Self::to_bytes`] made, and the values behind it.
+    pub fn split(bytes: &[u8]) -> Option<(Self, &[u8])> {
+        let mut counters = Self::default();
+        let (head, values) = bytes.split_at_checked(Self::COUNT * 8)?;
+        for (field, bytes) in counters.fields().into_iter().zip(head.as_chunks::<8>().0) {
+            *field = u64::from_le_bytes(*bytes);
+        }
+        Some((counters, values))
+    }
+
     /// Adds another tile's. A worker's nonsense does not overflow.
     pub fn add(&mut self, other: &Self) {
-        let add = |sum: &mut u64, value: u64| *sum = sum.saturating_add(value);
-        add(&mut self.receivers, other.receivers);
-        add(&mut self.cut_elements, other.cut_elements);
-        add(&mut self.nodes_visited, other.nodes_visited);
-        add(&mut self.traversal_bytes, other.traversal_bytes);
-        add(&mut self.local_hits, other.local_hits);
-        add(&mut self.shared_hits, other.shared_hits);
-        add(&mut self.shared_hits_other_job, other.shared_hits_other_job);
-        add(&mut self.cache_misses, other.cache_misses);
-        add(&mut self.cpu_nanos, other.cpu_nanos);
-        add(&mut self.io_nanos, other.io_nanos);
+        for (sum, value) in self.fields().into_iter().zip(other.clone().fields()) {
+            *sum = sum.saturating_add(*value);
+        }
     }
 }
 
@@ -81,18 +117,17 @@ pub async fn prepare(
     dispatcher: &Arc<Dispatcher>,
     job: JobNo,
     task: &ShadeTask,
+    stored: Option<String>,
     mut abort: watch::Receiver<bool>,
 ) -> Result<Shading, String> {
     let gate = tokio::select! {
         gate = dispatcher.picture_gate.lock() => gate,
         _ = abort.wait_for(|stop| *stop) => return Err(STOPPED.into()),
     };
-    let (mounts, task) = (dispatcher.mounts.clone(), task.clone());
-    let read = tokio::task::spawn_blocking(move || read(&mounts, &task)).await;
-    let (frame, mounted, environment) = read.map_err(|error| error.to_string())??;
-    let megabytes = (frame.pixel_count() * limits::PICTURE_BYTES_PER_PIXEL)
-        .div_ceil(1 << 20)
-        .max(1);
+    let (this, task) = (dispatcher.clone(), task.clone());
+    let read = tokio::task::spawn_blocking(move || read(&this, job, &task, stored)).await;
+    let (mut shading, pixels) = read.map_err(|error| error.to_string())??;
+    let megabytes = (pixels * limits::PICTURE_BYTES_PER_PIXEL).div_ceil(1 << 20).max(1);
     let available = dispatcher.config.memory.work_bytes >> 20;
     if megabytes > available {
         return Err(format!(
@@ -106,29 +141,31 @@ pub async fn prepare(
         _ = abort.wait_for(|stop| *stop) => return Err(STOPPED.into()),
     };
     drop(gate);
-    tracing::debug!(job = job.0, holes = frame.holes(), megabytes, "picture read");
-    Ok(Shading {
-        frame,
-        mounted,
-        environment,
-        counters: Counters::default(),
-        started: Instant::now(),
-        _memory: memory,
-    })
+    tracing::debug!(job = job.0, holes = shading.frame.holes(), megabytes, "picture read");
+    shading.memory = Some(memory);
+    shading.started = Instant::now();
+    Ok(shading)
 }
 
 /// Why a stopped job's task ended; the scheduler knows the real reason.
 const STOPPED: &str = "stopped";
 
-type Ingredients = (Framebuffer, Mounted, Option<Arc<Environment>>);
-
-fn read(mounts: &Mounts, task: &ShadeTask) -> Result<Ingredients, String> {
+/// Reads everything; also returns the pixels of the picture.
+fn read(
+    dispatcher: &Dispatcher,
+    job: JobNo,
+    task: &ShadeTask,
+    stored: Option<String>,
+) -> Result<(Shading, u64), String> {
     // Said now, not after the work is done.
     if !task.overwrite && std::fs::symlink_metadata(&task.output).is_ok() {
         let path = task.output.clone();
         return Err(StoreError::Exists { path }.to_string());
     }
-    let mounted = mounts.open(&task.scene).map_err(|error: JobError| error.text)?;
+    let mounted = dispatcher
+        .mounts
+        .open(&task.scene)
+        .map_err(|error: JobError| error.text)?;
     let environment = match &task.environment {
         Some(path) => {
             let environment = read_environment(path).map_err(|error| error.to_string())?;
@@ -136,6 +173,7 @@ fn read(mounts: &Mounts, task: &ShadeTask) -> Result<Ingredients, String> {
         }
         None => None,
     };
+    let fingerprint = fingerprint(&mounted, task);
     let gbuffer = GBuffer::read(&task.gbuffer).map_err(|error| error.to_string())?;
     let pixels = gbuffer.pixel_count() as u64;
     if pixels > IMAGE_PIXELS_MAX {
@@ -144,7 +182,59 @@ fn read(mounts: &Mounts, task: &ShadeTask) -> Result<Ingredients, String> {
             "picture of {pixels} pixels, at most {IMAGE_PIXELS_MAX} are shaded, in {path}"
         ));
     }
-    Ok((Framebuffer::new(gbuffer), mounted, environment))
+    let mut shading = Shading {
+        frame: Framebuffer::new(gbuffer),
+        mounted,
+        environment,
+        counters: Counters::default(),
+        tiles_left: Vec::new(),
+        tiles_stored: 0,
+        fingerprint,
+        started: Instant::now(),
+        memory: None,
+    };
+    shading.tiles_left = shading.frame.tiles();
+    if stored.as_ref() == Some(&shading.fingerprint) {
+        take_stored_tiles(dispatcher, job, &mut shading);
+    } else {
+        dispatcher.table.drop_tiles(job);
+    }
+    Ok((shading, pixels))
+}
+
+/// Puts tiles in place that a former run stored. What does not fit is shaded again.
+fn take_stored_tiles(dispatcher: &Dispatcher, job: JobNo, shading: &mut Shading) {
+    let tiles = dispatcher.table.tiles(job).unwrap_or_else(|error| {
+        tracing::warn!(error, job = job.0, "stored tiles cannot be read");
+        Vec::new()
+    });
+    let left: HashSet<u32> = shading.tiles_left.iter().copied().collect();
+    let mut taken = HashSet::new();
+    for (tile, bytes) in tiles.iter().filter(|(tile, _)| left.contains(tile)) {
+        if let Some((counters, values)) = Counters::split(bytes)
+            && shading.frame.check(*tile, values).is_ok()
+        {
+            shading.frame.fill(*tile, values);
+            shading.counters.add(&counters);
+            taken.insert(*tile);
+        }
+    }
+    shading.tiles_left.retain(|tile| !taken.contains(tile));
+    shading.tiles_stored = taken.len() as u64;
+}
+
+/// The build of the scene, and length, time and place of the other files.
+fn fingerprint(mounted: &Mounted, task: &ShadeTask) -> String {
+    let file = |path: &PathBuf| {
+        let known = std::fs::metadata(path).map(|file| {
+            let (bytes, seconds, nanos, inode) = (file.len(), file.mtime(), file.mtime_nsec(), file.ino());
+            format!("{bytes}-{seconds}.{nanos}-{inode}")
+        });
+        known.unwrap_or_default()
+    };
+    let environment = task.environment.as_ref().map(file).unwrap_or_default();
+    let build_id = mounted.scene().info().build_id;
+    format!("{build_id} {} {environment}", file(&task.gbuffer))
 }
 
 /// Adds up and writes the picture.
@@ -169,9 +259,7 @@ pub async fn write(
         statistics: statistics.clone(),
         scratch: dispatcher.config.options.scratch_dir.clone(),
     };
-    let Shading {
-        frame, _memory: memory, ..
-    } = shading;
+    let Shading { frame, memory, .. } = shading;
     let written = tokio::task::spawn_blocking(move || {
         let written = output::write(&picture, frame.into_planes(), &|| *abort.borrow());
         drop(memory);

@@ -58,6 +58,11 @@ impl StateDir {
         })
     }
 
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     fn note(&self) -> PathBuf {
         self.path.join("segment")
     }

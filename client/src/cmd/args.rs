@@ -3,6 +3,7 @@
 use super::failure::Failure;
 use super::files::{self, Existing};
 use clap::Args;
+use pbgi_client::JobOptions;
 use pbgi_client::private::PrivateOptions;
 use pbgi_client::size::parse_bytes;
 use pbgi_core::{BuildSettings, ShadeSettings, limits};
@@ -206,6 +207,49 @@ fn positive(text: &str) -> Result<f32, String> {
     match text.parse::<f32>() {
         Ok(value) if value > 0.0 && value.is_finite() => Ok(value),
         _ => Err("it must be a number above 0".to_owned()),
+    }
+}
+
+/// How a job stands among others.
+#[derive(Args, Clone, Debug, Default)]
+#[command(next_help_heading = "Job")]
+pub(crate) struct JobArgs {
+    /// The job's id, for jobs, watch and cancel; the same id with the same task is the same job [default: made up]
+    #[arg(long, value_name = "ID")]
+    pub(crate) job_id: Option<String>,
+    /// For whom; users of equal priority share the workers [default: you]
+    #[arg(long, value_name = "USER")]
+    user: Option<String>,
+    /// Words that records, logs and metrics bear, like show=dune or shot=12; may be repeated
+    #[arg(long = "label", value_name = "NAME=VALUE", value_parser = label)]
+    labels: Vec<(String, String)>,
+    /// Higher ones go first, -1000 to 1000
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    priority: i32,
+    /// A job that must succeed first; may be repeated
+    #[arg(long, value_name = "JOB")]
+    after: Vec<String>,
+    /// Submit the job, print its id, and leave
+    #[arg(long)]
+    pub(crate) detach: bool,
+}
+
+impl JobArgs {
+    pub(crate) fn options(&self) -> JobOptions {
+        JobOptions {
+            user: self.user.clone().unwrap_or_default(),
+            labels: self.labels.iter().cloned().collect(),
+            priority: self.priority,
+            after: self.after.clone(),
+            ..JobOptions::default()
+        }
+    }
+}
+
+fn label(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((name, value)) if !name.is_empty() => Ok((name.to_owned(), value.to_owned())),
+        _ => Err("it must look like show=dune".to_owned()),
     }
 }
 

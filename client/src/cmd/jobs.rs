@@ -1,6 +1,6 @@
 //! `build`, `shade`, and what is done with jobs: `jobs`, `watch`, `cancel`.
 
-use super::args::{DensityArgs, OctreeArgs, OutputArgs, QualityArgs, RunningArgs, ServerArgs, StatsArgs};
+use super::args::{DensityArgs, JobArgs, OctreeArgs, OutputArgs, QualityArgs, RunningArgs, ServerArgs, StatsArgs};
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
@@ -30,6 +30,8 @@ pub(crate) struct BuildArgs {
     #[command(flatten)]
     octree: OctreeArgs,
     #[command(flatten)]
+    job: JobArgs,
+    #[command(flatten)]
     stats: StatsArgs,
     #[command(flatten)]
     server: ServerArgs,
@@ -44,7 +46,15 @@ pub(crate) async fn build(args: BuildArgs, interrupt: &Interrupt) -> Result<(), 
         settings: args.octree.settings()?,
         density: args.density.density(),
     };
-    run(Work::Build(job), &args.output, &args.stats, &args.server, interrupt).await
+    run(
+        Work::Build(job),
+        &args.output,
+        &args.job,
+        &args.stats,
+        &args.server,
+        interrupt,
+    )
+    .await
 }
 
 const SHADE_EXAMPLES: &str = "\
@@ -69,6 +79,8 @@ pub(crate) struct ShadeArgs {
     #[command(flatten)]
     quality: QualityArgs,
     #[command(flatten)]
+    job: JobArgs,
+    #[command(flatten)]
     stats: StatsArgs,
     #[command(flatten)]
     server: ServerArgs,
@@ -85,12 +97,21 @@ pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), 
         environment: args.quality.environment.as_deref().map(files::input).transpose()?,
         workers: args.server.job_workers(),
     };
-    run(Work::Shade(job), &args.output, &args.stats, &args.server, interrupt).await
+    run(
+        Work::Shade(job),
+        &args.output,
+        &args.job,
+        &args.stats,
+        &args.server,
+        interrupt,
+    )
+    .await
 }
 
 async fn run(
     work: Work,
     output: &OutputArgs,
+    job: &JobArgs,
     stats: &StatsArgs,
     server: &ServerArgs,
     interrupt: &Interrupt,
@@ -99,7 +120,14 @@ async fn run(
     let statistics = {
         let mut progress = Progress::new();
         let client = session::connect(server, interrupt, &progress).await?;
-        session::run(&client, &work, interrupt, &mut progress).await?
+        let options = job.options();
+        let submitted = session::submit(&client, &work, job.job_id.as_deref(), &options, &progress);
+        let submitted = interrupt.guard(submitted).await?;
+        if job.detach {
+            println!("{}", submitted.id);
+            return Ok(());
+        }
+        session::follow(&client, &submitted.id, interrupt, &mut progress).await?
     };
     eprintln!("wrote {}", output.output.display());
     summary::report(&statistics, stats.stats.as_deref())
@@ -108,11 +136,19 @@ async fn run(
 /// `jobs`
 #[derive(Args, Debug)]
 pub(crate) struct ListArgs {
+    /// One job in full, with its history
+    #[arg(value_name = "JOB")]
+    job: Option<String>,
     #[command(flatten)]
     running: RunningArgs,
 }
 
 pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Failure> {
+    if let Some(id) = &args.job {
+        let (_, job) = interrupt.guard(session::find_job(&args.running, id)).await?;
+        print!("{}", in_full(&job));
+        return Ok(());
+    }
     let jobs = interrupt.guard(async {
         let mut jobs = Vec::new();
         for client in session::running(&args.running).await? {
@@ -138,6 +174,51 @@ pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Fa
         }
     }
     Ok(())
+}
+
+fn in_full(job: &Job) -> String {
+    let options = &job.options;
+    let words = |(name, value): (&String, &String)| format!("{name}={value}");
+    let labels: Vec<String> = options.labels.iter().map(words).collect();
+    let rows = [
+        ("job", job.id.clone()),
+        ("task", job.title.clone()),
+        (
+            "state",
+            format!("{} {} {}", job.state.name(), job.stage, share(job))
+                .trim_end()
+                .to_owned(),
+        ),
+        ("user", options.user.clone()),
+        ("labels", labels.join(" ")),
+        ("priority", options.priority.to_string()),
+        ("after", options.after.join(" ")),
+        ("error", job.error.clone()),
+    ];
+    let given = rows.iter().filter(|(_, value)| !value.is_empty());
+    let mut text: String = given.map(|(name, value)| format!("{name:9} {value}\n")).collect();
+    for event in &job.history {
+        text.push_str(&format!("{}  {}\n", utc(event.unix_millis), event.text));
+    }
+    text
+}
+
+/// Date and time in UTC.
+fn utc(unix_millis: i64) -> String {
+    let (days, millis) = (unix_millis.div_euclid(86_400_000), unix_millis.rem_euclid(86_400_000));
+    // The civil calendar repeats every 400 years; years are counted from March, so that the leap day comes last.
+    let shifted = days + 719_468;
+    let (era, day) = (shifted.div_euclid(146_097), shifted.rem_euclid(146_097));
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let (date, month_number) = (
+        day - (153 * month + 2) / 5 + 1,
+        if month < 10 { month + 3 } else { month - 9 },
+    );
+    let year = year + era * 400 + i64::from(month_number <= 2);
+    let (hours, minutes, seconds) = (millis / 3_600_000, millis / 60_000 % 60, millis / 1_000 % 60);
+    format!("{year:04}-{month_number:02}-{date:02}T{hours:02}:{minutes:02}:{seconds:02}Z")
 }
 
 /// How far a running job's stage is.
@@ -178,12 +259,15 @@ pub(crate) async fn watch(args: WatchArgs, interrupt: &Interrupt) -> Result<(), 
     summary::report(&statistics, args.stats.stats.as_deref())
 }
 
-/// `cancel`
+/// `cancel` and `pause`
 #[derive(Args, Debug)]
 pub(crate) struct CancelArgs {
     /// The job, as jobs lists it
     #[arg(value_name = "JOB")]
     job: String,
+    /// Why, for the job's history
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    reason: String,
     #[command(flatten)]
     running: RunningArgs,
 }
@@ -194,7 +278,7 @@ pub(crate) async fn cancel(args: CancelArgs, interrupt: &Interrupt) -> Result<()
         if before.state.ended() {
             return Ok(before);
         }
-        Ok(client.cancel(&args.job).await?)
+        Ok(client.cancel(&args.job, &args.reason).await?)
     });
     let job = job.await?;
     let state = if job.state.ended() {
@@ -204,4 +288,61 @@ pub(crate) async fn cancel(args: CancelArgs, interrupt: &Interrupt) -> Result<()
     };
     println!("{} is {state}", job.id);
     Ok(())
+}
+
+pub(crate) async fn pause(args: CancelArgs, interrupt: &Interrupt) -> Result<(), Failure> {
+    let job = interrupt.guard(async {
+        let (client, _) = session::find_job(&args.running, &args.job).await?;
+        Ok(client.pause(&args.job, &args.reason).await?)
+    });
+    let job = job.await?;
+    println!("{} is {} {}", job.id, job.state.name(), job.stage);
+    Ok(())
+}
+
+/// `resume` and `retry`
+#[derive(Args, Debug)]
+pub(crate) struct JobNameArgs {
+    /// The job, as jobs lists it
+    #[arg(value_name = "JOB")]
+    job: String,
+    #[command(flatten)]
+    running: RunningArgs,
+}
+
+pub(crate) async fn resume(args: JobNameArgs, interrupt: &Interrupt) -> Result<(), Failure> {
+    let job = interrupt.guard(async {
+        let (client, _) = session::find_job(&args.running, &args.job).await?;
+        Ok(client.resume(&args.job).await?)
+    });
+    let job = job.await?;
+    println!("{} is {} {}", job.id, job.state.name(), job.stage);
+    Ok(())
+}
+
+pub(crate) async fn retry(args: JobNameArgs, interrupt: &Interrupt) -> Result<(), Failure> {
+    let job = interrupt.guard(async {
+        let (client, _) = session::find_job(&args.running, &args.job).await?;
+        Ok(client.retry(&args.job).await?)
+    });
+    let job = job.await?;
+    println!("{} is {} {}", job.id, job.state.name(), job.stage);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_told_in_utc() {
+        for (millis, text) in [
+            (0, "1970-01-01T00:00:00Z"),
+            (951_827_696_789, "2000-02-29T12:34:56Z"),
+            (1_795_586_400_000, "2026-11-25T06:00:00Z"),
+            (-1, "1969-12-31T23:59:59Z"),
+        ] {
+            assert_eq!(utc(millis), text);
+        }
+    }
 }

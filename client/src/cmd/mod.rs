@@ -66,6 +66,12 @@ enum Command {
     Watch(jobs::WatchArgs),
     /// Cancel a job
     Cancel(jobs::CancelArgs),
+    /// Let a job rest; its finished tiles are kept
+    Pause(jobs::CancelArgs),
+    /// Let a paused job go on
+    Resume(jobs::JobNameArgs),
+    /// Put a job that failed or was cancelled back in line
+    Retry(jobs::JobNameArgs),
     /// Stop the daemon once it has finished what is leased
     Shutdown(daemon::ShutdownArgs),
 }
@@ -112,6 +118,9 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
         Command::Jobs(args) => jobs::list(args, interrupt).await,
         Command::Watch(args) => jobs::watch(args, interrupt).await,
         Command::Cancel(args) => jobs::cancel(args, interrupt).await,
+        Command::Pause(args) => jobs::pause(args, interrupt).await,
+        Command::Resume(args) => jobs::resume(args, interrupt).await,
+        Command::Retry(args) => jobs::retry(args, interrupt).await,
         Command::Shutdown(args) => daemon::shutdown(args, interrupt).await,
     }
 }
@@ -131,7 +140,7 @@ mod tests {
         let command = Arguments::command();
         for name in [
             "demo", "render", "sample", "gbuffer", "build", "shade", "info", "status", "jobs", "watch", "cancel",
-            "shutdown",
+            "pause", "resume", "retry", "shutdown",
         ] {
             assert!(command.find_subcommand(name).is_some(), "{name}");
         }

@@ -5,7 +5,7 @@ use super::failure::Failure;
 use super::interrupt::Interrupt;
 use super::progress::Progress;
 use pbgi_client::private::{Folders, server_program};
-use pbgi_client::{BuildJob, Client, ClientError, Job, JobState, Refusal, ShadeJob};
+use pbgi_client::{BuildJob, Client, ClientError, Job, JobOptions, JobState, Refusal, ShadeJob};
 use pbgi_core::Statistics;
 use std::time::Duration;
 
@@ -82,20 +82,42 @@ pub(crate) async fn run(
     interrupt: &Interrupt,
     progress: &mut Progress,
 ) -> Result<Statistics, Failure> {
+    let job = submit(client, work, None, &JobOptions::default(), progress).await?;
+    follow(client, &job.id, interrupt, progress).await
+}
+
+/// Submits `work` under a name, or under one made up.
+pub(crate) async fn submit(
+    client: &Client,
+    work: &Work,
+    name: Option<&str>,
+    options: &JobOptions,
+    progress: &Progress,
+) -> Result<Job, Failure> {
     let kind = match work {
         Work::Build(_) => "build",
         Work::Shade(_) => "shade",
     };
     // The id makes a repeated submit harmless; chance keeps those of different commands apart.
-    let id = format!("{kind}-{:016x}", rand::random::<u64>());
-    match work {
-        Work::Build(job) => client.submit_build(&id, job).await?,
-        Work::Shade(job) => client.submit_shade(&id, job).await?,
+    let chance = || format!("{kind}-{:016x}", rand::random::<u64>());
+    let id = name.map_or_else(chance, str::to_owned);
+    // A command that is repeated after its daemon was killed finds its job under way.
+    let options = JobOptions {
+        attach: name.is_none(),
+        ..options.clone()
     };
-    follow(client, &id, interrupt, progress).await
+    let job = match work {
+        Work::Build(job) => client.submit_build(&id, job, &options).await?,
+        Work::Shade(job) => client.submit_shade(&id, job, &options).await?,
+    };
+    if job.id != id {
+        progress.say(&format!("job {} is making this already: following it", job.id));
+    }
+    Ok(job)
 }
 
-async fn follow(
+/// Follows a job to its end, cancels it when the user interrupts. Returns the statistics of a job that succeeded.
+pub(crate) async fn follow(
     client: &Client,
     id: &str,
     interrupt: &Interrupt,
@@ -114,7 +136,7 @@ async fn follow(
 /// Cancels on behalf of the user, and says what became of the job.
 async fn cancelled(client: &Client, id: &str, progress: &mut Progress) -> Failure {
     progress.stage("cancelling");
-    if let Err(error) = client.cancel(id).await {
+    if let Err(error) = client.cancel(id, "interrupted").await {
         return Failure::Interrupted(format!("job {id} could not be cancelled: {error}"));
     }
     match tokio::time::timeout(CANCEL_WAIT, client.watch(id, |_| {})).await {

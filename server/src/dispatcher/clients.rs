@@ -1,14 +1,16 @@
 //! What clients ask of the daemon.
 
-use super::{Dispatcher, Record};
+use super::durable::{Kept, user_number};
+use super::{Dispatcher, Record, State};
 use crate::error::{JobError, JobErrorKind};
-use crate::job::{JobState, JobStatus, Request, check_job_id, check_path, no_such_job};
+use crate::job::{JobOptions, JobState, JobStatus, Request, check_job_id, check_path, no_such_job};
 use crate::limits;
 use crate::mounts::MountStatus;
-use crate::scheduler::{Event, JobNo};
+use crate::scheduler::{DRAINING, Event, JobNo, Order};
 use crate::supervisor::WorkerBirth;
 use pbgi_cache::CacheCounters;
 use pbgi_core::{PageKind, SceneInfo, Statistics};
+use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
@@ -33,24 +35,75 @@ pub struct DaemonStatus {
     pub jobs_running: usize,
 }
 
+/// A job as it is handed in.
+#[derive(Clone, Debug)]
+pub struct Submission {
+    /// The client's name for it.
+    pub id: String,
+    /// The task.
+    pub request: Request,
+    /// What is wanted beside it.
+    pub options: JobOptions,
+    /// Whether an unfinished job with the same task will do.
+    pub attach: bool,
+    /// All of that as it came over the wire, to be kept.
+    pub wire: Vec<u8>,
+}
+
+/// The span that everything about a job is logged in.
+pub(super) fn span(status: &JobStatus) -> tracing::Span {
+    let options = &status.options;
+    let labels: Vec<String> = options
+        .labels
+        .iter()
+        .map(|(key, value)| format!("{key}={value}"))
+        .collect();
+    tracing::info_span!(
+        "job",
+        id = status.id,
+        number = status.number.0,
+        title = status.title,
+        user = options.user,
+        labels = labels.join(" ")
+    )
+}
+
 impl Dispatcher {
-    /// Takes a job; the same name with the same request is the same job.
+    /// Takes a job; the same name with the same request is the same job. Returns when the job will survive the daemon.
     ///
     /// # Errors
-    /// A request that makes no sense, a name that is taken, an output that another job makes, or a full queue.
-    pub fn submit(self: &Arc<Self>, id: &str, request: Request) -> Result<JobStatus, JobError> {
-        check_job_id(id)?;
-        request.validate()?;
-        let mut state = self.lock();
-        if let Some(record) = state.names.get(id).and_then(|number| state.jobs.get(number)) {
-            if *record.request == request {
-                return Ok(record.status.borrow().clone());
+    /// A request that makes no sense, a name that is taken, an output that another job makes, a full queue, or a disk that
+    /// does not take it.
+    pub async fn submit(self: &Arc<Self>, submission: Submission) -> Result<JobStatus, JobError> {
+        check_job_id(&submission.id)?;
+        submission.options.validate()?;
+        submission.request.validate()?;
+        let (job, status) = {
+            let mut state = self.lock();
+            match state.find_same(&submission)? {
+                Some(job) => (job, state.status(job)?),
+                None => self.take(&mut state, submission)?,
             }
-            let text = format!("job {id:?} exists with another request; choose another name");
-            return Err(JobError::new(JobErrorKind::Exists, text));
+        };
+        let stored = self.table.ticket().await;
+        if let Err(reason) = stored.unwrap_or_else(|_| Err("the job table was closed".to_owned())) {
+            let mut state = self.lock();
+            let event = Event::Fail {
+                job,
+                reason: reason.clone(),
+            };
+            self.dispatch(&mut state, event, None);
+            return Err(JobError::new(JobErrorKind::Unavailable, reason));
         }
+        Ok(status)
+    }
+
+    fn take(self: &Arc<Self>, state: &mut State, submission: Submission) -> Result<(JobNo, JobStatus), JobError> {
         if state.draining {
-            return Err(JobError::new(JobErrorKind::Unavailable, crate::scheduler::DRAINING));
+            return Err(JobError::new(JobErrorKind::Unavailable, DRAINING));
+        }
+        if let Some(reason) = self.table.broken() {
+            return Err(JobError::new(JobErrorKind::Unavailable, reason));
         }
         if state.scheduler.counts().0 >= limits::JOBS_QUEUED_MAX {
             let text = format!(
@@ -59,28 +112,46 @@ impl Dispatcher {
             );
             return Err(JobError::new(JobErrorKind::Exhausted, text));
         }
-        if !state.outputs.insert(request.output().to_owned()) {
-            let text = format!("another job is making this output, at {}", request.output().display());
-            return Err(JobError::new(JobErrorKind::Busy, text));
-        }
+        let Submission {
+            id,
+            request,
+            options,
+            wire,
+            ..
+        } = submission;
+        let order = Order {
+            priority: options.priority,
+            user: user_number(&options.user),
+            after: state.before(&options.after)?,
+            paused: options.paused,
+        };
         state.number_last += 1;
         let job = JobNo(state.number_last);
-        let status = JobStatus {
-            id: id.to_owned(),
+        state.claim_output(&request, job)?;
+        let mut status = JobStatus {
+            id: id.clone(),
             number: job,
             state: JobState::Queued,
-            stage: "waiting",
+            stage: waiting(&options).into(),
             done: 0,
             total: 0,
             error: String::new(),
             statistics: Statistics::default(),
             title: request.title(),
+            options,
+            history: VecDeque::new(),
+            suspended: false,
         };
-        let span = tracing::info_span!("job", id, number = job.0, title = status.title);
+        status.note("submitted");
+        let span = span(&status);
         span.in_scope(|| tracing::info!("job accepted"));
         let kind = request.kind();
         let record = Record {
             request: Arc::new(request),
+            kept: Kept {
+                wire: wire.into(),
+                ..Kept::default()
+            },
             status: watch::Sender::new(status),
             abort: watch::Sender::new(false),
             span,
@@ -88,17 +159,19 @@ impl Dispatcher {
             memory_peak_bytes: 0,
             cache_peak_bytes: 0,
         };
+        self.save(job, &record);
         state.jobs.insert(job, record);
-        state.names.insert(id.to_owned(), job);
+        state.names.insert(id, job);
+        self.enqueue(state, Event::Submit { job, kind, order });
+        Ok((job, state.status(job)?))
+    }
+
+    fn enqueue(self: &Arc<Self>, state: &mut State, event: Event) {
         state.active = Instant::now();
         if state.parked > 0 {
             self.supervisor.unpark();
         }
-        self.dispatch(&mut state, Event::Submit { job, kind }, None);
-        match state.jobs.get(&job) {
-            Some(record) => Ok(record.status.borrow().clone()),
-            None => Err(no_such_job(id)),
-        }
+        self.dispatch(state, event, None);
     }
 
     /// A job as it is now.
@@ -121,13 +194,14 @@ impl Dispatcher {
             .ok_or_else(|| no_such_job(id))
     }
 
-    /// All jobs that are remembered, newest first.
-    pub fn jobs(&self) -> Vec<JobStatus> {
+    /// The jobs that are remembered, newest first, at most so many.
+    pub fn jobs(&self, limit: usize) -> Vec<JobStatus> {
         let state = self.lock();
         state
             .jobs
             .values()
             .rev()
+            .take(limit)
             .map(|record| record.status.borrow().clone())
             .collect()
     }
@@ -136,14 +210,126 @@ impl Dispatcher {
     ///
     /// # Errors
     /// There is none of that name.
-    pub fn cancel(self: &Arc<Self>, id: &str) -> Result<JobStatus, JobError> {
+    pub fn cancel(self: &Arc<Self>, id: &str, reason: &str) -> Result<JobStatus, JobError> {
         let mut state = self.lock();
-        let job = *state.names.get(id).ok_or_else(|| no_such_job(id))?;
+        let job = state.number(id)?;
+        if let Some(record) = state.jobs.get_mut(&job)
+            && !record.status.borrow().state.ended()
+        {
+            record
+                .status
+                .send_modify(|status| status.note(with_reason("cancel requested", reason)));
+            record.kept.cancelled = true;
+            self.save(job, record);
+        }
         self.dispatch(&mut state, Event::Cancel { job }, None);
-        let record = state.jobs.get(&job);
-        record
-            .map(|record| record.status.borrow().clone())
-            .ok_or_else(|| no_such_job(id))
+        state.status(job)
+    }
+
+    /// Lets a job rest. One that rests or has ended stays as it is.
+    ///
+    /// # Errors
+    /// There is none of that name, or it is a build that runs or a picture that is being written.
+    pub fn pause(self: &Arc<Self>, id: &str, reason: &str) -> Result<JobStatus, JobError> {
+        let mut state = self.lock();
+        let job = state.number(id)?;
+        let status = state.status(job)?;
+        if status.state.ended() || status.options.paused {
+            return Ok(status);
+        }
+        if !state.scheduler.can_pause(job) {
+            let text = format!(
+                "job {id:?} is {} and cannot be paused any more; it can be cancelled",
+                status.stage
+            );
+            return Err(JobError::new(JobErrorKind::Precondition, text));
+        }
+        if let Some(record) = state.jobs.get(&job) {
+            record.status.send_modify(|status| {
+                status.options.paused = true;
+                status.stage = if status.state == JobState::Queued {
+                    "paused"
+                } else {
+                    "pausing"
+                }
+                .into();
+                status.note(with_reason("paused", reason));
+            });
+            self.save(job, record);
+        }
+        self.dispatch(&mut state, Event::Pause { job }, None);
+        state.status(job)
+    }
+
+    /// Lets a paused job go on.
+    ///
+    /// # Errors
+    /// There is none of that name.
+    pub fn resume(self: &Arc<Self>, id: &str) -> Result<JobStatus, JobError> {
+        let mut state = self.lock();
+        let job = state.number(id)?;
+        let status = state.status(job)?;
+        if status.state.ended() || !status.options.paused {
+            return Ok(status);
+        }
+        if let Some(record) = state.jobs.get(&job) {
+            record.status.send_modify(|status| {
+                status.options.paused = false;
+                status.stage = if status.state == JobState::Queued {
+                    "waiting"
+                } else {
+                    "shading"
+                }
+                .into();
+                status.note("resumed");
+            });
+            self.save(job, record);
+        }
+        self.enqueue(&mut state, Event::Resume { job });
+        state.status(job)
+    }
+
+    /// Puts a job that failed or was cancelled back in line. Any other stays as it is.
+    ///
+    /// # Errors
+    /// There is none of that name, another job makes its output, or the daemon takes no jobs.
+    pub fn retry(self: &Arc<Self>, id: &str) -> Result<JobStatus, JobError> {
+        let mut state = self.lock();
+        let job = state.number(id)?;
+        let status = state.status(job)?;
+        if !matches!(status.state, JobState::Failed | JobState::Cancelled) {
+            return Ok(status);
+        }
+        if state.draining {
+            return Err(JobError::new(JobErrorKind::Unavailable, DRAINING));
+        }
+        let after = state.before(&status.options.after)?;
+        let Some(request) = state.jobs.get(&job).map(|record| record.request.clone()) else {
+            return Err(no_such_job(id));
+        };
+        state.claim_output(&request, job)?;
+        state.ended.retain(|ended| *ended != job);
+        state.failed.retain(|failed| *failed != job);
+        if let Some(record) = state.jobs.get_mut(&job) {
+            record.abort.send_replace(false);
+            (record.kept.cancelled, record.kept.daemon_deaths) = (false, 0);
+            record.status.send_modify(|status| {
+                (status.state, status.error) = (JobState::Queued, String::new());
+                status.stage = waiting(&status.options).into();
+                (status.done, status.total) = (0, 0);
+                status.note("tried again");
+            });
+            self.save(job, record);
+        }
+        let order = Order {
+            priority: status.options.priority,
+            user: user_number(&status.options.user),
+            after,
+            paused: status.options.paused,
+        };
+        let kind = request.kind();
+        self.enqueue(&mut state, Event::Submit { job, kind, order });
+        state.status(job)
     }
 
     /// Opens, mounts and describes a scene.
@@ -204,7 +390,90 @@ impl Dispatcher {
         if let Some(record) = self.lock().jobs.get(&job) {
             record
                 .status
-                .send_modify(|status| (status.stage, status.done, status.total) = (stage, done, total));
+                .send_modify(|status| (status.stage, status.done, status.total) = (stage.into(), done, total));
         }
+    }
+}
+
+fn with_reason(what: &str, reason: &str) -> String {
+    let reason: String = reason
+        .chars()
+        .filter(|c| !c.is_control())
+        .take(limits::LABEL_CHARS_MAX)
+        .collect();
+    if reason.is_empty() {
+        what.to_owned()
+    } else {
+        format!("{what}: {reason}")
+    }
+}
+
+fn waiting(options: &JobOptions) -> &'static str {
+    match options.paused {
+        true => "paused",
+        false => "waiting",
+    }
+}
+
+impl State {
+    fn number(&self, id: &str) -> Result<JobNo, JobError> {
+        self.names.get(id).copied().ok_or_else(|| no_such_job(id))
+    }
+
+    fn status(&self, job: JobNo) -> Result<JobStatus, JobError> {
+        let record = self.jobs.get(&job);
+        record
+            .map(|record| record.status.borrow().clone())
+            .ok_or_else(|| no_such_job(&job.0.to_string()))
+    }
+
+    /// The job that a submission means, if it is there.
+    fn find_same(&self, submission: &Submission) -> Result<Option<JobNo>, JobError> {
+        let Submission {
+            id, request, options, ..
+        } = submission;
+        if let Some((&job, record)) = self.names.get(id).and_then(|job| Some((job, self.jobs.get(job)?))) {
+            let known = &record.status.borrow().options;
+            let same_options = (&known.user, &known.labels, known.priority, &known.after)
+                == (&options.user, &options.labels, options.priority, &options.after);
+            if *record.request == *request && same_options {
+                return Ok(Some(job));
+            }
+            let text = format!("job {id:?} exists with another request; choose another name");
+            return Err(JobError::new(JobErrorKind::Exists, text));
+        }
+        let same = self.outputs.get(request.output()).filter(|job| {
+            let record = self.jobs.get(job);
+            record.is_some_and(|record| submission.attach && *record.request == *request)
+        });
+        Ok(same.copied())
+    }
+
+    /// Numbers of the jobs that must succeed first.
+    fn before(&self, ids: &[String]) -> Result<Vec<JobNo>, JobError> {
+        let mut numbers = Vec::new();
+        for id in ids {
+            let job = self.number(id)?;
+            match self.status(job)?.state {
+                JobState::Succeeded => {}
+                JobState::Queued | JobState::Running => numbers.push(job),
+                JobState::Failed | JobState::Cancelled => {
+                    let text = format!("job {id:?}, which it comes after, did not succeed; retry that one first");
+                    return Err(JobError::new(JobErrorKind::Precondition, text));
+                }
+            }
+        }
+        Ok(numbers)
+    }
+
+    fn claim_output(&mut self, request: &Request, job: JobNo) -> Result<(), JobError> {
+        let output = request.output();
+        if let Some(other) = self.outputs.get(output) {
+            let id = self.status(*other).map(|status| status.id).unwrap_or_default();
+            let text = format!("job {id:?} is making this output, at {}", output.display());
+            return Err(JobError::new(JobErrorKind::Busy, text));
+        }
+        self.outputs.insert(output.to_owned(), job);
+        Ok(())
     }
 }

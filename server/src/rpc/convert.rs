@@ -2,7 +2,7 @@
 
 use crate::dispatcher::{DaemonStatus, TaskInfo};
 use crate::error::JobError;
-use crate::job::{BuildTask, Density, JobState, JobStatus, Request, ShadeTask};
+use crate::job::{BuildTask, Density, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
 use crate::shade_job::Counters;
 use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
 use pbgi_proto::v1;
@@ -30,6 +30,21 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
             workers: (task.workers > 0).then_some(task.workers as usize),
         })),
         None => Err(JobError::invalid("the request has no task")),
+    }
+}
+
+pub(super) fn options(options: Option<v1::JobOptions>, caller: &str) -> JobOptions {
+    let given = options.unwrap_or_default();
+    JobOptions {
+        user: if given.user.is_empty() {
+            caller.to_owned()
+        } else {
+            given.user
+        },
+        labels: given.labels.into_iter().collect(),
+        priority: given.priority,
+        after: given.after,
+        paused: given.paused,
     }
 }
 
@@ -62,15 +77,28 @@ pub(super) fn job(status: JobStatus) -> v1::Job {
         JobState::Failed => v1::JobState::Failed,
         JobState::Cancelled => v1::JobState::Cancelled,
     };
+    let event = |event: JobEvent| v1::JobEvent {
+        unix_millis: event.unix_millis,
+        text: event.text,
+    };
+    let history = status.history.into_iter().map(event);
     v1::Job {
         job_id: status.id,
         state: state.into(),
-        stage: status.stage.into(),
+        stage: status.stage.into_owned(),
         done: status.done,
         total: status.total,
         error: status.error,
         statistics: Some(statistics(&status.statistics)),
         title: status.title,
+        options: Some(v1::JobOptions {
+            user: status.options.user,
+            labels: status.options.labels.into_iter().collect(),
+            priority: status.options.priority,
+            after: status.options.after,
+            paused: status.options.paused,
+        }),
+        history: history.collect(),
     }
 }
 

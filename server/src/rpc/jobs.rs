@@ -2,7 +2,8 @@
 
 use super::convert;
 use super::status::status;
-use crate::dispatcher::Dispatcher;
+use crate::dispatcher::{Dispatcher, Submission};
+use crate::error::{JobError, JobErrorKind};
 use crate::job::JobStatus;
 use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_server::DaemonService;
@@ -12,6 +13,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::server::UdsConnectInfo;
 use tonic::{Request, Response, Status};
 
 /// How long a watcher may leave a message unread before it is dropped.
@@ -35,9 +37,16 @@ impl JobService for Jobs {
     type WatchJobStream = ReceiverStream<Result<v1::Job, Status>>;
 
     async fn submit_job(&self, request: Request<v1::SubmitJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let caller = caller(&request);
         let request = request.into_inner();
-        let task = convert::request(request.task).map_err(status)?;
-        let job = self.dispatcher.submit(&request.job_id, task).map_err(status)?;
+        let submission = Submission {
+            wire: prost::Message::encode_to_vec(&request),
+            id: request.job_id,
+            request: convert::request(request.task).map_err(status)?,
+            options: convert::options(request.options, &caller),
+            attach: request.attach,
+        };
+        let job = self.dispatcher.submit(submission).await.map_err(status)?;
         Ok(Response::new(convert::job(job)))
     }
 
@@ -46,37 +55,91 @@ impl JobService for Jobs {
         Ok(Response::new(convert::job(job)))
     }
 
-    async fn list_jobs(&self, _: Request<v1::ListJobsRequest>) -> Result<Response<v1::ListJobsResponse>, Status> {
-        let jobs = self.dispatcher.jobs().into_iter().map(convert::job).collect();
+    async fn list_jobs(&self, request: Request<v1::ListJobsRequest>) -> Result<Response<v1::ListJobsResponse>, Status> {
+        let limit = match request.into_inner().limit {
+            0 => usize::MAX,
+            limit => limit as usize,
+        };
+        let jobs = self.dispatcher.jobs(limit).into_iter().map(convert::job).collect();
         Ok(Response::new(v1::ListJobsResponse { jobs }))
     }
 
     async fn watch_job(&self, request: Request<v1::WatchJobRequest>) -> Result<Response<Self::WatchJobStream>, Status> {
-        let job = self.dispatcher.watch(&request.into_inner().job_id).map_err(status)?;
+        let request = request.into_inner();
+        let job = self.dispatcher.watch(&request.job_id).map_err(status)?;
         let (sender, receiver) = mpsc::channel(1);
-        tokio::spawn(forward(job, sender));
+        let dispatcher = self.dispatcher.clone();
+        tokio::spawn(async move {
+            let seen_to_its_end = forward(job, sender).await;
+            if request.cancel_on_disconnect && !seen_to_its_end {
+                // A job that is forgotten has ended.
+                let _ = dispatcher.cancel(&request.job_id, "its watcher left");
+            }
+        });
         Ok(Response::new(ReceiverStream::new(receiver)))
     }
 
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Result<Response<v1::Job>, Status> {
-        let job = self.dispatcher.cancel(&request.into_inner().job_id).map_err(status)?;
+        let request = request.into_inner();
+        let job = self
+            .dispatcher
+            .cancel(&request.job_id, &request.reason)
+            .map_err(status)?;
+        Ok(Response::new(convert::job(job)))
+    }
+
+    async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let request = request.into_inner();
+        let job = self
+            .dispatcher
+            .pause(&request.job_id, &request.reason)
+            .map_err(status)?;
+        Ok(Response::new(convert::job(job)))
+    }
+
+    async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let job = self.dispatcher.resume(&request.into_inner().job_id).map_err(status)?;
+        Ok(Response::new(convert::job(job)))
+    }
+
+    async fn retry_job(&self, request: Request<v1::RetryJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let job = self.dispatcher.retry(&request.into_inner().job_id).map_err(status)?;
         Ok(Response::new(convert::job(job)))
     }
 }
 
-/// Sends a job's latest state until it ends, or until nobody reads.
-async fn forward(mut job: watch::Receiver<JobStatus>, sender: mpsc::Sender<Result<v1::Job, Status>>) {
+/// Who calls, by name: the owner of the process at the other end.
+fn caller<T>(request: &Request<T>) -> String {
+    let peer = request
+        .extensions()
+        .get::<UdsConnectInfo>()
+        .and_then(|info| info.peer_cred);
+    let Some(uid) = peer.map(|peer| peer.uid()) else {
+        return String::new();
+    };
+    let user = nix::unistd::User::from_uid(uid.into()).ok().flatten();
+    user.map_or_else(|| uid.to_string(), |user| user.name)
+}
+
+/// Sends a job's latest state until it ends, or until nobody reads. Returns whether it ended.
+async fn forward(mut job: watch::Receiver<JobStatus>, sender: mpsc::Sender<Result<v1::Job, Status>>) -> bool {
     loop {
         let now = job.borrow_and_update().clone();
-        let ended = now.state.ended();
-        let sent = tokio::time::timeout(STALL_MAX, sender.send(Ok(convert::job(now)))).await;
-        if ended || !matches!(sent, Ok(Ok(()))) {
-            return;
+        let (ended, suspended) = (now.state.ended(), now.suspended);
+        let message = if suspended {
+            let text = "the daemon is shutting down; the next one goes on with the job";
+            Err(status(JobError::new(JobErrorKind::Unavailable, text)))
+        } else {
+            Ok(convert::job(now))
+        };
+        let sent = tokio::time::timeout(STALL_MAX, sender.send(message)).await;
+        if ended || suspended || !matches!(sent, Ok(Ok(()))) {
+            return ended || suspended;
         }
         tokio::time::sleep(WATCH_INTERVAL).await;
         tokio::select! {
-            changed = job.changed() => if changed.is_err() { return },
-            () = sender.closed() => return,
+            changed = job.changed() => if changed.is_err() { return true },
+            () = sender.closed() => return false,
         }
     }
 }

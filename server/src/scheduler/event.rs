@@ -1,7 +1,7 @@
 //! The words of the scheduler: what happens, and what is to be done.
 
 /// Number of a job, given in order of arrival.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize)]
 pub struct JobNo(pub u64);
 
 /// Number of a lease, never used twice.
@@ -29,6 +29,23 @@ pub enum Kind {
     },
 }
 
+/// Number of a user, for fair shares.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct UserNo(pub u32);
+
+/// What a submitter wants beside the job itself.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Order {
+    /// Higher ones go first.
+    pub priority: i32,
+    /// Whose job it is: users of equal priority share the workers.
+    pub user: UserNo,
+    /// Jobs that must succeed first; those that have ended are not named.
+    pub after: Vec<JobNo>,
+    /// Whether it waits for [`Event::Resume`].
+    pub paused: bool,
+}
+
 /// How a job ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum End {
@@ -38,6 +55,10 @@ pub enum End {
     Failed(String),
     /// Somebody asked.
     Cancelled,
+    /// A job that it comes after did not succeed.
+    Unmet(JobNo),
+    /// The daemon stops; the next one goes on with it.
+    Suspended,
 }
 
 /// Something that happened.
@@ -49,6 +70,8 @@ pub enum Event {
         job: JobNo,
         /// Its needs.
         kind: Kind,
+        /// Its place among others.
+        order: Order,
     },
     /// A shading job's picture is cut into tiles.
     Prepared {
@@ -66,6 +89,23 @@ pub enum Event {
     },
     /// Somebody asked to stop a job.
     Cancel {
+        /// The job.
+        job: JobNo,
+    },
+    /// A job may not run.
+    Fail {
+        /// The job.
+        job: JobNo,
+        /// Why.
+        reason: String,
+    },
+    /// A job is to rest: its leased tiles are finished, and nothing else.
+    Pause {
+        /// The job.
+        job: JobNo,
+    },
+    /// A paused job is to go on.
+    Resume {
         /// The job.
         job: JobNo,
     },
@@ -104,7 +144,7 @@ pub enum Event {
     },
     /// Time passed.
     Tick,
-    /// The daemon stops: nothing new, only leased tiles are finished.
+    /// The daemon stops: nothing new, only leased tiles and pictures that are being written are finished.
     Drain,
 }
 
@@ -148,6 +188,8 @@ pub enum Effect {
     Alive,
     /// Kill a worker whose lease ran out, and report its death.
     Kill(Seat),
+    /// A paused job's last lease ended: let go of its picture. [`Effect::Start`] brings it back.
+    Park(JobNo),
     /// All tiles are there: write the picture.
     Write(JobNo),
     /// The job ended.

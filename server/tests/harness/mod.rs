@@ -1,6 +1,8 @@
 //! A real daemon in a folder of its own, ended and checked for leftovers when dropped.
 #![allow(dead_code, reason = "each test program uses a part")]
 
+pub(crate) mod site;
+
 use hyper_util::rt::TokioIo;
 use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_client::DaemonServiceClient;
@@ -18,6 +20,7 @@ pub(crate) const SERVER: &str = env!("CARGO_BIN_EXE_pbgi-server");
 pub(crate) struct Daemon {
     pub(crate) child: Child,
     pub(crate) folder: TempDir,
+    worker: PathBuf,
 }
 
 /// A worker that sleeps.
@@ -62,15 +65,35 @@ pub(crate) fn first_line(child: &mut Child) -> String {
 impl Daemon {
     pub(crate) fn start(worker: impl FnOnce(&Path) -> PathBuf, change: impl FnOnce(&mut Command)) -> Self {
         let folder = tempfile::Builder::new().prefix("pbgi").tempdir().unwrap();
-        let mut command = command(folder.path(), &worker(folder.path()));
+        let worker = worker(folder.path());
+        let mut command = command(folder.path(), &worker);
         let log = std::fs::File::create(folder.path().join("log")).unwrap();
         command.stderr(log);
         change(&mut command);
         let mut child = command.spawn().unwrap();
         let line = first_line(&mut child);
-        let daemon = Self { child, folder };
+        let daemon = Self { child, folder, worker };
         assert_eq!(line, "READY", "{}", daemon.log());
         daemon
+    }
+
+    /// Kills the daemon without warning and starts another one in the same folders; returns how long that took to be ready.
+    pub(crate) fn kill_and_restart(&mut self) -> Duration {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+        self.restart()
+    }
+
+    /// Starts another daemon where one has ended.
+    pub(crate) fn restart(&mut self) -> Duration {
+        let begun = Instant::now();
+        let log = std::fs::File::options()
+            .append(true)
+            .open(self.folder.path().join("log"))
+            .unwrap();
+        self.child = command(self.folder.path(), &self.worker).stderr(log).spawn().unwrap();
+        assert_eq!(first_line(&mut self.child), "READY", "{}", self.log());
+        begun.elapsed()
     }
 
     pub(crate) fn log(&self) -> String {
