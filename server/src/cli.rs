@@ -3,6 +3,7 @@
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use pbgi_core::limits::{NODES_PER_PAGE_DEFAULT, POINTS_PER_PAGE_DEFAULT};
 use pbgi_server::budget::parse_bytes;
+use pbgi_server::config_file::ConfigFile;
 use pbgi_server::{Options, ServerError};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -31,6 +32,18 @@ pub(crate) struct Arguments {
 pub(crate) enum Command {
     /// Serve until stopped (the default)
     Serve(ServeArguments),
+    /// Check the options and the configuration file, and tell what the daemon would do
+    Check(ServeArguments),
+    /// Write the manual page into a directory
+    Man {
+        /// The directory
+        directory: PathBuf,
+    },
+    /// Print completions for a shell
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
     /// Build one scene for a daemon
     #[command(hide = true)]
     BuildChild,
@@ -38,6 +51,9 @@ pub(crate) enum Command {
 
 #[derive(Clone, Debug, Args)]
 pub(crate) struct ServeArguments {
+    /// Options in a file (TOML); those on the command line win. SIGHUP reads it again for what is logged
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
     /// Serve one user without supervision: leave the session, log to STATE_DIR/server.log, exit when idle
     #[arg(long)]
     pub(crate) private: bool,
@@ -62,18 +78,18 @@ pub(crate) struct ServeArguments {
     /// The worker program [default: pbgi-worker beside this one]
     #[arg(long, value_name = "PATH")]
     worker_binary: Option<PathBuf>,
-    /// Nodes in the largest node page that the cache holds
-    #[arg(long, value_name = "N", default_value_t = NODES_PER_PAGE_DEFAULT)]
-    nodes_per_page: u32,
-    /// Points in the largest point page that the cache holds
-    #[arg(long, value_name = "N", default_value_t = POINTS_PER_PAGE_DEFAULT)]
-    points_per_page: u32,
-    /// What is logged: a level or a filter like pbgi_server=debug
-    #[arg(long, value_name = "FILTER", default_value = "info")]
-    pub(crate) log: String,
-    /// How it is logged
-    #[arg(long, value_name = "FORMAT", default_value = "text")]
-    pub(crate) log_format: LogFormat,
+    /// Nodes in the largest node page that the cache holds [default: 256]
+    #[arg(long, value_name = "N")]
+    nodes_per_page: Option<u32>,
+    /// Points in the largest point page that the cache holds [default: 1024]
+    #[arg(long, value_name = "N")]
+    points_per_page: Option<u32>,
+    /// What is logged: a level or a filter like pbgi_server=debug [default: info]
+    #[arg(long, value_name = "FILTER")]
+    log: Option<String>,
+    /// How it is logged [default: text]
+    #[arg(long, value_name = "FORMAT")]
+    log_format: Option<LogFormat>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -85,8 +101,35 @@ pub(crate) enum LogFormat {
 }
 
 impl ServeArguments {
-    /// With the environment's defaults filled in.
-    pub(crate) fn options(&self) -> Result<Options, ServerError> {
+    /// What the configuration file says; nothing if there is none.
+    pub(crate) fn file(&self) -> Result<ConfigFile, ServerError> {
+        let Some(path) = &self.config else {
+            return Ok(ConfigFile::default());
+        };
+        let text = std::fs::read_to_string(path).map_err(|source| ServerError::Io {
+            action: "read the configuration",
+            path: path.clone(),
+            source,
+        })?;
+        ConfigFile::parse(&text).map_err(|problems| {
+            let line = |problem| format!("{problem}, in {}", path.display());
+            ServerError::Configuration(problems.into_iter().map(line).collect())
+        })
+    }
+
+    pub(crate) fn log<'a>(&'a self, file: &'a ConfigFile) -> &'a str {
+        self.log.as_deref().or(file.log.as_deref()).unwrap_or("info")
+    }
+
+    pub(crate) fn log_format(&self, file: &ConfigFile) -> LogFormat {
+        self.log_format.unwrap_or(match file.log_format.as_deref() {
+            Some("json") => LogFormat::Json,
+            _ => LogFormat::Text,
+        })
+    }
+
+    /// With the file's values and the environment's defaults filled in.
+    pub(crate) fn options(&self, file: &ConfigFile) -> Result<Options, ServerError> {
         let own = std::env::current_exe().map_err(|error| ServerError::Setup {
             action: "find this program",
             reason: error.to_string(),
@@ -98,21 +141,36 @@ impl ServeArguments {
                 reason: error.to_string(),
             })
         };
-        let idle = self.idle_seconds.or(self.private.then_some(PRIVATE_IDLE_SECONDS));
+        let idle = self
+            .idle_seconds
+            .or(file.idle_seconds)
+            .or(self.private.then_some(PRIVATE_IDLE_SECONDS));
+        let folder = |given: &Option<PathBuf>, filed: &Option<PathBuf>, default: &PathBuf| {
+            absolute(given.as_ref().or(filed.as_ref()).unwrap_or(default))
+        };
+        let filed_workers = file.workers.map(|count| usize::try_from(count).unwrap_or(usize::MAX));
+        let small = |count: u64| u32::try_from(count).unwrap_or(u32::MAX);
         Ok(Options {
-            runtime_dir: absolute(self.runtime_dir.as_ref().unwrap_or(&folders.runtime))?,
-            state_dir: absolute(self.state_dir.as_ref().unwrap_or(&folders.state))?,
-            scratch_dir: absolute(self.scratch_dir.as_ref().unwrap_or(&folders.scratch))?,
-            memory_bytes: self.memory,
-            workers: self.workers.unwrap_or_else(cores),
+            runtime_dir: folder(&self.runtime_dir, &file.runtime_dir, &folders.runtime)?,
+            state_dir: folder(&self.state_dir, &file.state_dir, &folders.state)?,
+            scratch_dir: folder(&self.scratch_dir, &file.scratch_dir, &folders.scratch)?,
+            memory_bytes: self.memory.or(file.memory),
+            workers: self.workers.or(filed_workers).unwrap_or_else(cores),
             idle: idle.map(Duration::from_secs),
             worker_binary: match &self.worker_binary {
                 Some(path) => absolute(path)?,
                 None => own.with_file_name("pbgi-worker"),
             },
             server_binary: own,
-            nodes_per_page: self.nodes_per_page,
-            points_per_page: self.points_per_page,
+            nodes_per_page: self
+                .nodes_per_page
+                .or(file.nodes_per_page.map(small))
+                .unwrap_or(NODES_PER_PAGE_DEFAULT),
+            points_per_page: self
+                .points_per_page
+                .or(file.points_per_page.map(small))
+                .unwrap_or(POINTS_PER_PAGE_DEFAULT),
+            access: file.access.clone(),
         })
     }
 }

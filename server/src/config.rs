@@ -1,5 +1,6 @@
 //! What the daemon runs with: one value, checked once.
 
+use crate::access::{Access, Auth};
 use crate::budget::{Machine, MemoryPlan};
 use crate::error::ServerError;
 use crate::limits;
@@ -32,6 +33,8 @@ pub struct Options {
     pub nodes_per_page: u32,
     /// Largest point page that will be cached, in records.
     pub points_per_page: u32,
+    /// Who may call, and what they may name.
+    pub access: Access,
 }
 
 impl Options {
@@ -48,6 +51,7 @@ impl Options {
             server_binary,
             nodes_per_page: NODES_PER_PAGE_DEFAULT,
             points_per_page: POINTS_PER_PAGE_DEFAULT,
+            access: Access::default(),
         }
     }
 }
@@ -96,7 +100,73 @@ impl Config {
     }
 }
 
+impl Config {
+    /// What the daemon will do and why, a line for each matter.
+    pub fn explain(&self) -> Vec<String> {
+        let (options, memory, access) = (&self.options, &self.memory, &self.options.access);
+        let megabytes = |bytes: u64| bytes >> 20;
+        let mut lines = vec![
+            format!(
+                "memory: {} MiB{}; {} MiB page cache, {} MiB builds and pictures, the rest for {} workers and the daemon",
+                megabytes(memory.total_bytes),
+                match options.memory_bytes {
+                    Some(_) => "",
+                    None => " (the smaller of 2G and four fifths of what the machine has to give)",
+                },
+                megabytes(memory.segment_bytes),
+                megabytes(memory.work_bytes),
+                options.workers,
+            ),
+            format!("clients: {}", options.jobs_socket().display()),
+            format!("page and metrics: {}", options.http_socket().display()),
+            format!("state: {}", options.state_dir.display()),
+            format!("scratch: {}", options.scratch_dir.display()),
+        ];
+        let users: Vec<String> = access.users.iter().map(ToString::to_string).collect();
+        if !users.is_empty() {
+            lines.push(format!("users that may call besides ours: {}", users.join(" ")));
+        }
+        for (name, root) in &access.roots {
+            let mut grants = Vec::new();
+            for (granted, what) in [
+                (root.read, "read"),
+                (root.write, "write"),
+                (root.overwrite, "overwrite"),
+            ] {
+                grants.extend(granted.then_some(what));
+            }
+            lines.push(format!("root {name}: {} ({})", root.path.display(), grants.join(", ")));
+        }
+        match &access.tcp {
+            Some(tcp) if tcp.auth == Auth::DangerouslyInsecure => {
+                lines.push(format!(
+                    "TCP: {}, DANGEROUSLY INSECURE: anybody on this machine may call",
+                    tcp.address
+                ));
+            }
+            Some(tcp) => lines.push(format!("TCP: {}, mutual TLS", tcp.address)),
+            None => lines.push("TCP: off".to_owned()),
+        }
+        lines.extend(
+            access
+                .http
+                .map(|address| format!("page and metrics also: http://{address}/")),
+        );
+        lines.extend(
+            options
+                .idle
+                .map(|idle| format!("exits after {} s without jobs", idle.as_secs())),
+        );
+        lines
+    }
+}
+
 impl Options {
+    /// The socket of the page and the metrics.
+    pub fn http_socket(&self) -> PathBuf {
+        self.runtime_dir.join("http.sock")
+    }
+
     /// The socket of clients.
     pub fn jobs_socket(&self) -> PathBuf {
         self.runtime_dir.join("jobs.sock")

@@ -11,12 +11,13 @@ use crate::scheduler::{Death, Seat};
 use crate::state::StateDir;
 use crate::supervisor::{Handle, Nursery, Plan, Supervisor, WorkerBirth};
 use crate::table::JobTable;
+use nix::unistd::Gid;
 use pbgi_cache::{CacheOwner, Segment};
 use pbgi_store::{OsVolume, sweep_scratch};
 use std::fs;
 use std::io;
-use std::os::unix::fs::PermissionsExt;
-use std::os::unix::net::UnixStream;
+use std::os::unix::fs::{PermissionsExt, chown as std_chown};
+use std::os::unix::net::{UnixListener as StdUnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -27,25 +28,42 @@ use tokio::task::JoinHandle;
 /// The sockets, bound.
 #[derive(Debug)]
 pub struct Listeners {
-    jobs: (UnixListener, PathBuf),
-    queue: (UnixListener, PathBuf),
+    jobs: UnixListener,
+    queue: UnixListener,
+    /// Names to remove in the end: those that we made.
+    made: Vec<PathBuf>,
 }
 
 impl Listeners {
-    /// Binds both sockets of a configuration. Needs a runtime.
+    /// Binds the sockets of a configuration; `activated` is the clients' one if a service manager has bound it. Needs a
+    /// runtime.
     ///
     /// # Errors
     /// A name that is taken by a living daemon, or the system refuses.
-    pub fn bind(config: &Config) -> Result<Self, ServerError> {
-        let bind = |path: PathBuf| Ok::<_, ServerError>((bind(&path)?, path));
-        Ok(Self {
-            jobs: bind(config.options.jobs_socket())?,
-            queue: bind(config.options.queue_socket())?,
-        })
+    pub fn bind(config: &Config, activated: Option<StdUnixListener>) -> Result<Self, ServerError> {
+        let (jobs_path, queue_path) = (config.options.jobs_socket(), config.options.queue_socket());
+        let (jobs, mut made) = match activated {
+            Some(listener) => {
+                let taken = listener
+                    .set_nonblocking(true)
+                    .and_then(|()| UnixListener::from_std(listener));
+                (
+                    taken.map_err(ServerError::setup("take the service manager's socket"))?,
+                    Vec::new(),
+                )
+            }
+            None => {
+                let group = config.options.access.group;
+                (bind(&jobs_path, group)?, vec![jobs_path])
+            }
+        };
+        let queue = bind(&queue_path, None)?;
+        made.push(queue_path);
+        Ok(Self { jobs, queue, made })
     }
 }
 
-fn bind(path: &Path) -> Result<UnixListener, ServerError> {
+fn bind(path: &Path, group: Option<Gid>) -> Result<UnixListener, ServerError> {
     match UnixStream::connect(path) {
         Ok(_) => {
             return Err(ServerError::Setup {
@@ -60,7 +78,15 @@ fn bind(path: &Path) -> Result<UnixListener, ServerError> {
         Err(_) => {}
     }
     let listener = UnixListener::bind(path).map_err(ServerError::io("bind a socket", path))?;
-    fs::set_permissions(path, fs::Permissions::from_mode(0o600)).map_err(ServerError::io("protect a socket", path))?;
+    let protect = |mode, path: &Path| {
+        std_chown(path, None, group.map(Gid::as_raw))?;
+        fs::set_permissions(path, fs::Permissions::from_mode(mode))
+    };
+    let protected = match (group, path.parent()) {
+        (Some(_), Some(folder)) => protect(0o660, path).and_then(|()| protect(0o750, folder)),
+        _ => protect(0o600, path),
+    };
+    protected.map_err(ServerError::io("protect a socket", path))?;
     Ok(listener)
 }
 
@@ -76,8 +102,18 @@ pub enum Stop {
     Now,
 }
 
-/// Runs until told to stop, idle for too long, or broken. `ready` is called when both sockets are served and the segment is
-/// reserved.
+/// Turns in the daemon's life that a service manager wants to hear of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Life {
+    /// The sockets are served and the segment is reserved.
+    Ready,
+    /// A few times a second: it can still take its own lock.
+    Alive,
+    /// It drains.
+    Stopping,
+}
+
+/// Runs until told to stop, idle for too long, or broken. `tell` is called at every turn of [`Life`].
 ///
 /// # Errors
 /// What kept it from starting.
@@ -85,11 +121,11 @@ pub async fn run(
     config: Config,
     state: StateDir,
     listeners: Listeners,
-    ready: impl FnOnce(),
+    tell: impl Fn(Life),
     mut stop: watch::Receiver<Stop>,
 ) -> Result<(), ServerError> {
-    let paths = [listeners.jobs.1.clone(), listeners.queue.1.clone()];
-    let outcome = run_daemon(&config, &state, listeners, ready, &mut stop).await;
+    let paths = listeners.made.clone();
+    let outcome = run_daemon(&config, &state, listeners, tell, &mut stop).await;
     for path in paths {
         // A stale socket is removed by the next start as well.
         let _ = fs::remove_file(path);
@@ -101,7 +137,7 @@ async fn run_daemon(
     config: &Config,
     state: &StateDir,
     listeners: Listeners,
-    ready: impl FnOnce(),
+    tell: impl Fn(Life),
     stop: &mut watch::Receiver<Stop>,
 ) -> Result<(), ServerError> {
     sweep(config, state)?;
@@ -114,8 +150,8 @@ async fn run_daemon(
     dispatcher.restore(rows, rpc::stored_request);
     let (ending, ended) = watch::channel(false);
     let servers = [
-        tokio::spawn(rpc::serve_jobs(listeners.jobs.0, dispatcher.clone(), ended.clone())),
-        tokio::spawn(rpc::serve_queue(listeners.queue.0, dispatcher.clone(), ended)),
+        tokio::spawn(rpc::serve_jobs(listeners.jobs, dispatcher.clone(), ended.clone())),
+        tokio::spawn(rpc::serve_queue(listeners.queue, dispatcher.clone(), ended)),
     ];
     tracing::info!(
         version = env!("CARGO_PKG_VERSION"),
@@ -125,8 +161,12 @@ async fn run_daemon(
         workers = config.options.workers,
         "ready"
     );
-    ready();
-    serve(config, &dispatcher, stop).await;
+    for line in config.explain() {
+        tracing::info!("{line}");
+    }
+    tell(Life::Ready);
+    serve(config, &dispatcher, &tell, stop).await;
+    tell(Life::Stopping);
     tracing::info!("stopping");
     drain(&dispatcher, stop).await;
     ending.send_replace(true);
@@ -212,7 +252,7 @@ fn start(
     }
 }
 
-async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, stop: &mut watch::Receiver<Stop>) {
+async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, tell: &impl Fn(Life), stop: &mut watch::Receiver<Stop>) {
     /// Ticks between two looks at the segment's name.
     const SEGMENT_TICKS: u32 = 5;
     let mut requested = dispatcher.stop_requested();
@@ -226,6 +266,7 @@ async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, stop: &mut watch::
             _ = requested.wait_for(|stop| *stop) => return,
         }
         dispatcher.tick();
+        tell(Life::Alive);
         ticks = ticks.wrapping_add(1);
         if ticks.is_multiple_of(SEGMENT_TICKS) {
             dispatcher.check_segment();

@@ -41,6 +41,9 @@ pub enum ServerError {
     /// Directories that cannot be used: all of them, one a line.
     #[error("{}", .0.join("\n"))]
     Directories(Vec<String>),
+    /// A configuration that cannot be: all problems, one a line.
+    #[error("{}", .0.join("\n"))]
+    Configuration(Vec<String>),
     /// The operating system refused.
     #[error("cannot {action}: {source}, at {}", .path.display())]
     Io {
@@ -89,7 +92,7 @@ impl ServerError {
     /// cannot hold it, 1 for the rest.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Self::Option { .. } | Self::InUse { .. } => 2,
+            Self::Option { .. } | Self::InUse { .. } | Self::Configuration(_) => 2,
             Self::Memory { .. } => 78,
             Self::Cache(CacheError::NoSpace { .. } | CacheError::BudgetTooSmall { .. }) => 78,
             _ => 1,

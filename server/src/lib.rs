@@ -6,10 +6,12 @@
 //! within [`rpc`]. This crate never shades: it does not link `pbgi-shade`.
 #![forbid(unsafe_code)]
 
+pub mod access;
 pub mod budget;
 pub mod build_child;
 pub mod builder;
 pub mod config;
+pub mod config_file;
 pub mod daemon;
 pub mod dispatcher;
 pub mod environment;
@@ -30,5 +32,5 @@ pub mod table;
 pub mod telemetry;
 
 pub use config::{Config, Options};
-pub use daemon::{Listeners, Stop, run};
+pub use daemon::{Life, Listeners, Stop, run};
 pub use error::ServerError;

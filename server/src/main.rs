@@ -4,16 +4,19 @@
 mod cli;
 mod process;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 use cli::{Arguments, LogFormat, ServeArguments};
 use pbgi_server::budget::Machine;
+use pbgi_server::config_file::ConfigFile;
 use pbgi_server::state::{StateDir, make_directories};
-use pbgi_server::{Config, Listeners, ServerError, Stop, build_child};
+use pbgi_server::{Config, Life, Listeners, ServerError, Stop, build_child};
 use std::io::Write;
 use std::process::ExitCode;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
@@ -23,6 +26,12 @@ fn main() -> ExitCode {
             false => ExitCode::FAILURE,
         },
         Some(cli::Command::Serve(serve)) => finish(serve_until_stopped(&serve)),
+        Some(cli::Command::Check(serve)) => finish(check(&serve)),
+        Some(cli::Command::Man { directory }) => finish(write_manual(&directory)),
+        Some(cli::Command::Completions { shell }) => {
+            clap_complete::generate(shell, &mut Arguments::command(), "pbgi-server", &mut std::io::stdout());
+            ExitCode::SUCCESS
+        }
         None => finish(serve_until_stopped(&arguments.serve)),
     }
 }
@@ -45,12 +54,31 @@ fn say(line: &str) {
     let _ = writeln!(stdout, "{line}").and_then(|()| stdout.flush());
 }
 
+fn check(arguments: &ServeArguments) -> Result<(), ServerError> {
+    let config = Config::new(arguments.options(&arguments.file()?)?, &Machine::probe()?)?;
+    for line in config.explain() {
+        say(&line);
+    }
+    Ok(())
+}
+
+fn write_manual(directory: &std::path::Path) -> Result<(), ServerError> {
+    let written = clap_mangen::generate_to(Arguments::command(), directory);
+    written.map_err(|source| ServerError::Io {
+        action: "write manual pages",
+        path: directory.to_owned(),
+        source,
+    })
+}
+
 fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
     if arguments.private {
         process::leave_the_session();
     }
     process::make_files_private();
-    let options = arguments.options()?;
+    let activated = process::activated_socket()?;
+    let file = arguments.file()?;
+    let options = arguments.options(&file)?;
     make_directories(&[&options.runtime_dir, &options.state_dir, &options.scratch_dir])?;
     let state = StateDir::take(&options.state_dir)?;
     // A stale segment would count as used memory.
@@ -59,7 +87,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
     if arguments.private {
         process::log_to(&config.options.log_file())?;
     }
-    init_tracing(arguments)?;
+    let log = init_tracing(arguments, &file)?;
     process::abort_on_core_panic();
     process::prefer_to_live();
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -71,25 +99,28 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
             reason: error.to_string(),
         })?;
     let outcome = runtime.block_on(async {
-        let listeners = Listeners::bind(&config)?;
+        let listeners = Listeners::bind(&config, activated)?;
         process::make_outputs_readable();
-        let stop = stop_on_signals()?;
+        let stop = stop_on_signals(arguments.clone(), log)?;
         let private = arguments.private;
-        let ready = || {
-            say("READY");
-            if private {
-                process::detach_stdout();
+        let tell = |life| {
+            process::tell_service_manager(life);
+            if life == Life::Ready {
+                say("READY");
+                if private {
+                    process::detach_stdout();
+                }
             }
         };
-        pbgi_server::run(config, state, listeners, ready, stop).await
+        pbgi_server::run(config, state, listeners, tell, stop).await
     });
     // Blocking tasks that still run belong to jobs that are given up.
     runtime.shutdown_background();
     outcome
 }
 
-/// The first signal drains, the second ends.
-fn stop_on_signals() -> Result<watch::Receiver<Stop>, ServerError> {
+/// The first signal drains, the second ends. SIGHUP reads the configuration file again if there is one.
+fn stop_on_signals(arguments: ServeArguments, log: LogHandle) -> Result<watch::Receiver<Stop>, ServerError> {
     let listen = |kind| {
         signal(kind).map_err(|error| ServerError::Setup {
             action: "listen for signals",
@@ -102,10 +133,15 @@ fn stop_on_signals() -> Result<watch::Receiver<Stop>, ServerError> {
     let (sender, receiver) = watch::channel(Stop::Run);
     tokio::spawn(async move {
         for stop in [Stop::Drain, Stop::Now] {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = interrupt.recv() => {}
-                _ = hangup.recv() => {}
+            loop {
+                tokio::select! {
+                    _ = terminate.recv() => break,
+                    _ = interrupt.recv() => break,
+                    _ = hangup.recv() => match arguments.config {
+                        Some(_) => reload(&arguments, &log),
+                        None => break,
+                    },
+                }
             }
             sender.send_replace(stop);
         }
@@ -114,18 +150,39 @@ fn stop_on_signals() -> Result<watch::Receiver<Stop>, ServerError> {
     Ok(receiver)
 }
 
-fn init_tracing(arguments: &ServeArguments) -> Result<(), ServerError> {
-    let filter = EnvFilter::try_new(&arguments.log).map_err(|error| ServerError::Option {
+/// Changes what is logged.
+type LogHandle = reload::Handle<EnvFilter, Registry>;
+
+fn log_filter(text: &str) -> Result<EnvFilter, ServerError> {
+    EnvFilter::try_new(text).map_err(|error| ServerError::Option {
         name: "--log",
-        value: arguments.log.clone(),
+        value: text.to_owned(),
         expected: format!("a filter like info or pbgi_server=debug ({error})"),
-    })?;
-    let subscriber = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr);
-    match arguments.log_format {
-        LogFormat::Text => subscriber.with_ansi(false).init(),
-        LogFormat::Json => subscriber.json().init(),
+    })
+}
+
+fn init_tracing(arguments: &ServeArguments, file: &ConfigFile) -> Result<LogHandle, ServerError> {
+    let (filter, handle) = reload::Layer::new(log_filter(arguments.log(file))?);
+    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    let lines = match arguments.log_format(file) {
+        LogFormat::Text => lines.with_ansi(false).boxed(),
+        LogFormat::Json => lines.json().boxed(),
+    };
+    tracing_subscriber::registry().with(filter).with(lines).init();
+    Ok(handle)
+}
+
+/// Takes over from the configuration file what can be changed while running.
+fn reload(arguments: &ServeArguments, log: &LogHandle) {
+    let reloaded = arguments.file().and_then(|file| {
+        let filter = log_filter(arguments.log(&file))?;
+        log.reload(filter).map_err(|error| ServerError::Setup {
+            action: "change what is logged",
+            reason: error.to_string(),
+        })
+    });
+    match reloaded {
+        Ok(()) => tracing::info!("the configuration was read again; all but the log filter needs a restart"),
+        Err(error) => tracing::error!(%error, "the configuration stays as it was"),
     }
-    Ok(())
 }

@@ -1,10 +1,13 @@
 //! What the program does to its own process.
 
+use nix::fcntl::{FcntlArg, FdFlag, fcntl};
 use nix::sys::stat::{Mode, umask};
 use nix::unistd::{close, dup2_stderr, dup2_stdin, dup2_stdout, setsid};
-use pbgi_server::ServerError;
+use pbgi_server::{Life, ServerError};
+use sd_notify::NotifyState;
 use std::fs::{self, File, OpenOptions};
 use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::net::UnixListener;
 use std::path::Path;
 
 /// A log longer than this is put aside when the daemon starts.
@@ -63,6 +66,40 @@ pub(crate) fn log_to(path: &Path) -> Result<(), ServerError> {
     dup2_stderr(&log).map_err(|errno| io(errno.into()))?;
     let null = File::open("/dev/null").map_err(io)?;
     dup2_stdin(&null).map_err(|errno| io(errno.into()))
+}
+
+/// The clients' socket, if a service manager has bound it for us.
+pub(crate) fn activated_socket() -> Result<Option<UnixListener>, ServerError> {
+    let setup = |reason: String| ServerError::Setup {
+        action: "take the service manager's socket",
+        reason,
+    };
+    let mut given = listenfd::ListenFd::from_env();
+    let listener = given.take_unix_listener(0).map_err(|error| setup(error.to_string()))?;
+    if given.len() > 1 {
+        let text = format!("{} sockets given, one is taken: that of clients", given.len());
+        return Err(setup(text));
+    }
+    if let Some(listener) = &listener {
+        // Workers must not inherit it.
+        fcntl(listener, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC)).map_err(|errno| setup(errno.to_string()))?;
+    }
+    Ok(listener)
+}
+
+/// What systemd wants to hear; nobody, if it did not start us.
+pub(crate) fn tell_service_manager(life: Life) {
+    let told = match life {
+        Life::Ready => sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("serving")]),
+        Life::Alive => match sd_notify::watchdog_enabled() {
+            Some(_) => sd_notify::notify(&[NotifyState::Watchdog]),
+            None => return,
+        },
+        Life::Stopping => sd_notify::notify(&[NotifyState::Stopping, NotifyState::Status("finishing leased tiles")]),
+    };
+    if let Err(error) = told {
+        tracing::warn!(%error, "the service manager does not listen");
+    }
 }
 
 /// Lets whoever started us see the end of our output.
