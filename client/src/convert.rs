@@ -4,7 +4,7 @@ use crate::job::{
     BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
 };
 use pbgi_core::{Bounds, BuildId, BuildSettings, NodeIndex, Quantizer, SceneInfo, ShadeSettings, Statistics};
-use pbgi_points::Density;
+use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius};
 use pbgi_proto::v1;
 use std::path::Path;
 
@@ -18,6 +18,7 @@ pub(crate) fn build_task(job: &BuildJob) -> Result<v1::BuildTask, String> {
             Density::Spacing(spacing) => v1::build_task::Density::Spacing(spacing),
             Density::Points(points) => v1::build_task::Density::Points(points),
         }),
+        cloud: Some(wire_cloud(&job.cloud)),
     })
 }
 
@@ -48,6 +49,27 @@ pub(crate) fn text(path: &Path) -> Result<String, String> {
     match path.to_str() {
         Some(text) => Ok(text.to_owned()),
         None => Err(format!("path {path:?} is not UTF-8; rename it")),
+    }
+}
+
+fn wire_cloud(cloud: &CloudOptions) -> v1::CloudSettings {
+    let (estimate_normals, viewpoint) = match cloud.estimate_normals {
+        None => (None, Vec::new()),
+        Some(Facing::Auto) => (Some(v1::Facing::Auto), Vec::new()),
+        Some(Facing::Up) => (Some(v1::Facing::Up), Vec::new()),
+        Some(Facing::Outward) => (Some(v1::Facing::Outward), Vec::new()),
+        Some(Facing::Viewpoint(eye)) => (Some(v1::Facing::Viewpoint), eye.to_vec()),
+    };
+    v1::CloudSettings {
+        origin: cloud.origin.map_or_else(Vec::new, |origin| origin.to_vec()),
+        skip_invalid_points: cloud.invalid_points == InvalidPoints::Skip,
+        recompute_bounds: cloud.recompute_bounds,
+        estimate_normals: estimate_normals.map(Into::into),
+        viewpoint,
+        radius: cloud.radius.map(|radius| match radius {
+            Radius::Estimate => v1::cloud_settings::Radius::EstimateRadius(true),
+            Radius::Fixed(radius) => v1::cloud_settings::Radius::FixedRadius(radius),
+        }),
     }
 }
 

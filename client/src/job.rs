@@ -1,7 +1,7 @@
 //! Jobs and daemon in plain types.
 
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
-use pbgi_points::Density;
+use pbgi_points::{CloudOptions, Density};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -18,6 +18,8 @@ pub struct BuildJob {
     pub settings: BuildSettings,
     /// How densely meshes are sampled; `None` for the default.
     pub density: Option<Density>,
+    /// How point clouds are read.
+    pub cloud: CloudOptions,
 }
 
 /// A scene and a G-buffer in, an image out.

@@ -15,4 +15,4 @@ pub mod size;
 pub use client::Client;
 pub use error::{ClientError, Refusal};
 pub use job::{BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
-pub use pbgi_points::Density;
+pub use pbgi_points::{CloudOptions, Density};

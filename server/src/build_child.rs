@@ -5,9 +5,10 @@ use crate::limits;
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::resource::{Resource, setrlimit};
 use nix::sys::signal::{SigSet, Signal};
+use pbgi_build::limits::MEMORY_MIN_BYTES;
 use pbgi_build::{BuildProgress, BuildReport, BuildRequest, build};
 use pbgi_core::{BuildSettings, Statistics};
-use pbgi_points::SampleOptions;
+use pbgi_points::{CloudOptions, InputOptions};
 use pbgi_store::Overwrite;
 use serde::{Deserialize, Serialize};
 use std::io::{self, Read, Write};
@@ -31,6 +32,8 @@ pub struct Spec {
     pub settings: BuildSettings,
     /// For meshes.
     pub density: Density,
+    /// For clouds.
+    pub cloud: CloudOptions,
     /// Where runs go.
     pub scratch_dir: PathBuf,
     /// The build's own limit.
@@ -76,8 +79,8 @@ pub fn run() -> bool {
         build_scene(&spec)
     });
     let (report, built) = match outcome {
-        Ok(report) => {
-            let statistics = Box::new(statistics(&report));
+        Ok(statistics) => {
+            let statistics = Box::new(statistics);
             (Report::Done { statistics }, true)
         }
         Err(error) => (Report::Failed { error }, false),
@@ -108,15 +111,19 @@ fn obey_the_daemon(spec: &Spec) -> Result<(), String> {
     setrlimit(Resource::RLIMIT_CORE, 0, 0).map_err(cannot("turn off core files"))
 }
 
-fn build_scene(spec: &Spec) -> Result<BuildReport, String> {
+fn build_scene(spec: &Spec) -> Result<Statistics, String> {
     let cancelled = cancel_flag()?;
-    let default = SampleOptions::default();
-    let options = SampleOptions {
+    let default = InputOptions::default();
+    let options = InputOptions {
         density: match spec.density {
             Density::Default => default.density,
             Density::Spacing(spacing) => pbgi_points::Density::Spacing(spacing),
             Density::Points(points) => pbgi_points::Density::Points(points),
         },
+        cloud: spec.cloud,
+        // What the build itself cannot do without comes first.
+        memory_bytes: spec.memory_bytes.saturating_sub(MEMORY_MIN_BYTES),
+        scratch_dir: spec.scratch_dir.clone(),
         ..default
     };
     let mut points = pbgi_points::open_input(&spec.inputs, &options).map_err(|error| error.to_string())?;
@@ -128,7 +135,7 @@ fn build_scene(spec: &Spec) -> Result<BuildReport, String> {
             Overwrite::Refuse
         },
         scratch_dir: spec.scratch_dir.clone(),
-        memory_bytes: spec.memory_bytes,
+        memory_bytes: spec.memory_bytes.saturating_sub(points.memory_bytes()),
         settings: spec.settings,
     };
     let mut last = None;
@@ -150,7 +157,11 @@ fn build_scene(spec: &Spec) -> Result<BuildReport, String> {
             ControlFlow::Continue(())
         }
     };
-    build(points.as_mut(), &request, &mut observer).map_err(|error| error.to_string())
+    let report = build(&mut points, &request, &mut observer).map_err(|error| error.to_string())?;
+    Ok(Statistics {
+        points_skipped: Some(points.skipped() as f64),
+        ..statistics(&report)
+    })
 }
 
 /// Set by SIGTERM. The signal is blocked in every thread and waited for in one, which needs no handler.

@@ -37,6 +37,7 @@ pub async fn run(
         overwrite: task.overwrite,
         settings: task.settings,
         density: task.density,
+        cloud: task.cloud,
         scratch_dir: dispatcher.config.options.scratch_dir.clone(),
         memory_bytes: memory.build_bytes,
         data_limit_bytes: memory.total_bytes,

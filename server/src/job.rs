@@ -4,6 +4,7 @@ use crate::error::{JobError, JobErrorKind};
 use crate::limits;
 use crate::scheduler::{JobNo, Kind};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
+use pbgi_points::CloudOptions;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
@@ -33,6 +34,8 @@ pub struct BuildTask {
     pub settings: BuildSettings,
     /// For meshes.
     pub density: Density,
+    /// For clouds.
+    pub cloud: CloudOptions,
 }
 
 /// A scene and a G-buffer in, a picture out.
@@ -320,6 +323,7 @@ mod tests {
             overwrite: false,
             settings: BuildSettings::default(),
             density: Density::Default,
+            cloud: CloudOptions::default(),
         };
         Request::Build(good.clone()).validate().unwrap();
         type Change = fn(&mut BuildTask);

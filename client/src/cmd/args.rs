@@ -7,7 +7,7 @@ use pbgi_client::JobOptions;
 use pbgi_client::private::PrivateOptions;
 use pbgi_client::size::parse_bytes;
 use pbgi_core::{BuildSettings, ShadeSettings, limits};
-use pbgi_points::Density;
+use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius};
 use std::path::PathBuf;
 
 /// Which daemon.
@@ -93,6 +93,86 @@ impl DensityArgs {
         let points = self.points.map(Density::Points);
         points.or(self.spacing.map(Density::Spacing))
     }
+}
+
+/// How point clouds are read.
+#[derive(Args, Clone, Copy, Debug, Default)]
+#[command(next_help_heading = "Point clouds")]
+pub(crate) struct CloudArgs {
+    /// Estimate normals from neighbouring points, turned up, out (away from the middle) or to a viewpoint X,Y,Z
+    /// [default: up for LAS and LAZ, else out]
+    #[arg(long, value_name = "SIDE", num_args = 0..=1, require_equals = true, default_missing_value = "auto", value_parser = facing)]
+    estimate_normals: Option<Facing>,
+    /// Radius of points whose file has none: auto, from their distances, or a length
+    #[arg(long, allow_negative_numbers = true, value_name = "R", value_parser = radius)]
+    radius: Option<Radius>,
+    /// Subtract X,Y,Z (in the file's axes) from positions that are too large for 32-bit floats [default: chosen from LAS headers]
+    #[arg(long, allow_negative_numbers = true, value_name = "X,Y,Z", value_parser = triple::<f64>)]
+    origin: Option<[f64; 3]>,
+    /// What to do with points that cannot be used: refuse the input, or skip and count them [default: refuse]
+    #[arg(long, value_name = "POLICY", value_parser = invalid_points)]
+    invalid_points: Option<InvalidPoints>,
+    /// Measure the points instead of believing the box that the file declares
+    #[arg(long)]
+    recompute_bounds: bool,
+}
+
+impl CloudArgs {
+    pub(crate) fn options(&self) -> CloudOptions {
+        CloudOptions {
+            origin: self.origin,
+            invalid_points: self.invalid_points.unwrap_or_default(),
+            recompute_bounds: self.recompute_bounds,
+            estimate_normals: self.estimate_normals,
+            radius: self.radius,
+        }
+    }
+
+    /// Tells where the world's origin is, if the files have it elsewhere.
+    pub(crate) fn say_origin(&self, inputs: &[PathBuf]) -> Result<(), Failure> {
+        let origin = pbgi_points::origin_of(inputs, &self.options())?;
+        if origin != [0.0; 3] {
+            let [x, y, z] = origin;
+            eprintln!("positions are relative to {x},{y},{z} of the files (--origin)");
+        }
+        Ok(())
+    }
+}
+
+fn facing(text: &str) -> Result<Facing, String> {
+    match text {
+        "auto" => Ok(Facing::Auto),
+        "up" => Ok(Facing::Up),
+        "out" => Ok(Facing::Outward),
+        _ => triple(text)
+            .map(Facing::Viewpoint)
+            .map_err(|_| "write up, out or a viewpoint X,Y,Z".to_owned()),
+    }
+}
+
+fn radius(text: &str) -> Result<Radius, String> {
+    match text {
+        "auto" => Ok(Radius::Estimate),
+        _ => positive(text)
+            .map(Radius::Fixed)
+            .map_err(|_| "it must be auto or a number above 0".to_owned()),
+    }
+}
+
+fn invalid_points(text: &str) -> Result<InvalidPoints, String> {
+    match text {
+        "refuse" => Ok(InvalidPoints::Refuse),
+        "skip" => Ok(InvalidPoints::Skip),
+        _ => Err("write refuse or skip".to_owned()),
+    }
+}
+
+/// Three finite numbers with commas between them.
+fn triple<T: std::str::FromStr + Copy + Into<f64>>(text: &str) -> Result<[T; 3], String> {
+    let numbers: Option<Vec<T>> = text.split(',').map(|word| word.trim().parse().ok()).collect();
+    let numbers = numbers.filter(|numbers| numbers.iter().all(|&number| number.into().is_finite()));
+    let triple = numbers.and_then(|numbers| <[T; 3]>::try_from(numbers).ok());
+    triple.ok_or_else(|| format!("{text:?} is no place: write three numbers with commas, such as 1,2.5,-3"))
 }
 
 /// How receivers are shaded.
@@ -273,6 +353,21 @@ mod tests {
         ] {
             assert!(picture_size(text).is_err(), "{text}");
         }
+    }
+
+    #[test]
+    fn places_sides_and_radii_are_read() {
+        assert_eq!(triple::<f64>("1, -2.5,3e6"), Ok([1.0, -2.5, 3e6]));
+        for text in ["", "1,2", "1,2,3,4", "1,2,x", "1,2,inf", "1,2,nan"] {
+            assert!(triple::<f64>(text).is_err(), "{text}");
+        }
+        assert_eq!(facing("0,1,2"), Ok(Facing::Viewpoint([0.0, 1.0, 2.0])));
+        assert_eq!((facing("up"), facing("out")), (Ok(Facing::Up), Ok(Facing::Outward)));
+        assert!(facing("down").is_err() && radius("0").is_err() && invalid_points("drop").is_err());
+        assert_eq!(
+            (radius("auto"), radius("0.5")),
+            (Ok(Radius::Estimate), Ok(Radius::Fixed(0.5)))
+        );
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! `build`, `shade`, and what is done with jobs: `jobs`, `watch`, `cancel`.
 
-use super::args::{DensityArgs, JobArgs, OctreeArgs, OutputArgs, QualityArgs, RunningArgs, ServerArgs, StatsArgs};
+use super::args::{
+    CloudArgs, DensityArgs, JobArgs, OctreeArgs, OutputArgs, QualityArgs, RunningArgs, ServerArgs, StatsArgs,
+};
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
@@ -14,19 +16,23 @@ use std::path::PathBuf;
 const BUILD_EXAMPLES: &str = "\
 Examples:
   pbgi-client build cloud.ply -o cloud.pbgi
-  pbgi-client build hall.glb chairs.obj -o hall.pbgi --spacing 0.02 --memory 1G";
+  pbgi-client build hall.glb chairs.obj -o hall.pbgi --spacing 0.02 --memory 1G
+  pbgi-client build tile1.laz tile2.laz -o town.pbgi --estimate-normals --radius auto";
 
 /// `build`
 #[derive(Args, Debug)]
 #[command(after_help = BUILD_EXAMPLES)]
 pub(crate) struct BuildArgs {
-    /// Meshes (.glb, .gltf, .obj), sampled and lit by their lights, and point clouds (.ply)
+    /// Meshes (.glb, .gltf, .obj), sampled and lit by their lights; point clouds (.ply, .las, .laz, .ptc), of which those of
+    /// the LAS family are turned so that y is up; scenes (.pbgi) whose points are built again
     #[arg(required = true, value_name = "INPUT")]
     inputs: Vec<PathBuf>,
     #[command(flatten)]
     output: OutputArgs,
     #[command(flatten)]
     density: DensityArgs,
+    #[command(flatten)]
+    cloud: CloudArgs,
     #[command(flatten)]
     octree: OctreeArgs,
     #[command(flatten)]
@@ -45,7 +51,9 @@ pub(crate) async fn build(args: BuildArgs, interrupt: &Interrupt) -> Result<(), 
         overwrite: existing.replaces(),
         settings: args.octree.settings()?,
         density: args.density.density(),
+        cloud: args.cloud.options(),
     };
+    args.cloud.say_origin(&job.inputs)?;
     run(
         Work::Build(job),
         &args.output,

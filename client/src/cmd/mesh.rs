@@ -1,6 +1,6 @@
 //! `sample` and `gbuffer`: what is made of a mesh here, without a daemon.
 
-use super::args::{CameraArgs, DensityArgs, OutputArgs, StatsArgs};
+use super::args::{CameraArgs, CloudArgs, DensityArgs, OutputArgs, StatsArgs};
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::frame;
@@ -8,8 +8,8 @@ use super::interrupt::Interrupt;
 use super::progress::Progress;
 use super::summary;
 use clap::Args;
-use pbgi_core::Statistics;
-use pbgi_points::{PointsError, SampleOptions, open_input, write_point_ply};
+use pbgi_core::{PointStream, Statistics};
+use pbgi_points::{InputOptions, PlyForm, PointsError, open_input, write_point_ply};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
@@ -23,13 +23,15 @@ Points carry the radiance that leaves them: direct light reflected once, and emi
 #[derive(Args, Debug)]
 #[command(after_help = SAMPLE_EXAMPLES)]
 pub(crate) struct SampleArgs {
-    /// Meshes that light each other: .glb, .gltf, .obj
+    /// Meshes that light each other (.glb, .gltf, .obj), and clouds (.ply, .las, .laz, .ptc, .pbgi), which are converted
     #[arg(required = true, value_name = "SCENE")]
     inputs: Vec<PathBuf>,
     #[command(flatten)]
     output: OutputArgs,
     #[command(flatten)]
     density: DensityArgs,
+    #[command(flatten)]
+    cloud: CloudArgs,
     #[command(flatten)]
     stats: StatsArgs,
 }
@@ -38,7 +40,9 @@ pub(crate) async fn sample(args: SampleArgs, interrupt: &Interrupt) -> Result<()
     args.stats.check()?;
     let inputs = files::inputs(&args.inputs)?;
     let output = files::output_of_kind(&args.output.output, Existing::from_flag(args.output.overwrite), "ply")?;
-    let mut options = SampleOptions::default();
+    let mut options = InputOptions::default();
+    options.cloud = args.cloud.options();
+    args.cloud.say_origin(&inputs)?;
     options.density = args.density.density().unwrap_or(options.density);
     let aside = interrupt.clone();
     // Not given up on a signal: the writer sees it, and removes the half-written file.
@@ -51,7 +55,7 @@ pub(crate) async fn sample(args: SampleArgs, interrupt: &Interrupt) -> Result<()
 fn write_points(
     inputs: &[PathBuf],
     output: &Path,
-    options: &SampleOptions,
+    options: &InputOptions,
     interrupt: &Interrupt,
 ) -> Result<Statistics, Failure> {
     let mut progress = Progress::new();
@@ -65,13 +69,14 @@ fn write_points(
             false => ControlFlow::Continue(()),
         }
     };
-    let points = match write_point_ply(output, &mut *stream, &mut observer) {
+    let points = match write_point_ply(output, PlyForm::Floats, &mut stream, &mut observer) {
         Err(PointsError::Cancelled) => return Err(Failure::Interrupted("nothing was written".to_owned())),
         written => written?,
     };
     let bytes = std::fs::metadata(output).map_or(0, |metadata| metadata.len());
     Ok(Statistics {
         points: Some(points as f64),
+        points_skipped: Some(stream.skipped() as f64),
         bytes_written: Some(bytes as f64),
         ..Default::default()
     })

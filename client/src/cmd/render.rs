@@ -13,7 +13,7 @@ use super::summary;
 use clap::Args;
 use pbgi_client::{BuildJob, Client, ShadeJob};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
-use pbgi_points::{Density, GBuffer, LayeredImage, SampleOptions, ToneMap, demo, write_png};
+use pbgi_points::{CloudOptions, Density, GBuffer, LayeredImage, SampleOptions, ToneMap, demo, write_png};
 use std::path::{Path, PathBuf};
 
 const RENDER_EXAMPLES: &str = "\
@@ -181,6 +181,7 @@ async fn scene(
             overwrite: true,
             settings: BuildSettings::default(),
             density: Some(plan.density),
+            cloud: CloudOptions::default(),
         };
         match plan.density {
             Density::Points(points) => progress.say(&format!("sampling about {} points", summary::grouped(points))),

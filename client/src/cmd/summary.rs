@@ -103,7 +103,7 @@ mod tests {
         let object: serde_json::Map<String, serde_json::Value> = serde_json::from_str(&text).unwrap();
         let names = "points nodes shading_calls sort_seconds build_seconds shading_seconds shading_cpu_seconds \
             shading_io_seconds out_of_core_bytes cache_peak_bytes peak_memory_bytes cache_hit_ratio cache_io_ratio \
-            redundant_reads reloads average_cut_size average_nodes_traversed average_traversal_bytes pages_loaded bytes_read \
+            points_skipped redundant_reads reloads average_cut_size average_nodes_traversed average_traversal_bytes pages_loaded bytes_read \
             bytes_written local_hits shared_hits shared_hits_other_job cache_misses holes";
         for name in names.split_whitespace() {
             assert!(object.contains_key(name), "{name}");

@@ -64,6 +64,8 @@ pub enum Unit {
 statistics! {
     /// Points of the scene.
     points: Count "Point count",
+    /// Points of the input that could not be used and were dropped.
+    points_skipped: Count "Points skipped",
     /// Nodes of the scene.
     nodes: Count "Node count",
     /// Receivers shaded.
@@ -126,6 +128,6 @@ mod tests {
         assert!(statistics.set("points", 5.0));
         assert!(!statistics.set("surfels", 5.0));
         assert_eq!(statistics.points, Some(5.0));
-        assert_eq!(statistics.rows().len(), 26);
+        assert_eq!(statistics.rows().len(), 27);
     }
 }

@@ -1,6 +1,5 @@
 //! What can go wrong with input and output: one error for the crate.
 
-use pbgi_core::point::InvalidPoint;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -58,8 +57,11 @@ pub enum PointsError {
         /// The file.
         path: PathBuf,
     },
-    /// A point with a number that cannot be used.
-    #[error("point {index} of {count}: {reason}, in {path:?}")]
+    /// Points with a number that cannot be used.
+    #[error(
+        "point {index} of {count}: {reason}; it is the first of {invalid} invalid points: repair them, or drop them with \
+         --invalid-points skip, in {path:?}"
+    )]
     InvalidPoint {
         /// Which point, from 0.
         index: u64,
@@ -67,12 +69,24 @@ pub enum PointsError {
         count: u64,
         /// The field and what is wrong with it.
         reason: String,
+        /// How many there are.
+        invalid: u64,
         /// The file.
         path: PathBuf,
     },
     /// An output file cannot be made.
     #[error(transparent)]
     Store(#[from] pbgi_store::StoreError),
+    /// What an input must keep in memory does not fit.
+    #[error("not enough memory: {what} needs {needed} bytes, {available} bytes are available; give more --memory")]
+    Memory {
+        /// What needs it.
+        what: &'static str,
+        /// Bytes needed.
+        needed: u64,
+        /// Bytes there are for it.
+        available: u64,
+    },
     /// The caller stopped it.
     #[error("cancelled")]
     Cancelled,
@@ -99,15 +113,6 @@ impl PointsError {
         Self::Unsupported {
             what: what.into(),
             remedy: remedy.into(),
-            path: path.to_owned(),
-        }
-    }
-
-    pub(crate) fn point(path: &Path, index: u64, count: u64, invalid: InvalidPoint) -> Self {
-        Self::InvalidPoint {
-            index,
-            count,
-            reason: invalid.to_string(),
             path: path.to_owned(),
         }
     }

@@ -1,7 +1,8 @@
 //! Where points come from, and what pictures are made of.
 //!
 //! [`open_input`] turns files into one stream of lit points: meshes ([`MeshScene`]: glTF, OBJ) are sampled evenly and lit by
-//! their lights with shadow rays, clouds (PLY) are read as they are. [`GBuffer`] says what a camera sees, rendered from a
+//! their lights with shadow rays, clouds ([`cloud`]: PLY, LAS, LAZ, COPC, PTC, built scenes) are read as they are, with
+//! normals and radii estimated where they have none. [`GBuffer`] says what a camera sees, rendered from a
 //! mesh or read from another renderer's EXR passes. [`image`] writes the pictures. [`demo`] makes a scene on the spot.
 //!
 //! World space is the file's, y up; radiance is linear, W/(m2 sr). Nothing here keeps all points in memory. This crate does
@@ -9,6 +10,7 @@
 #![forbid(unsafe_code)]
 
 pub mod camera;
+pub mod cloud;
 pub mod demo;
 pub mod error;
 pub mod gbuffer;
@@ -19,8 +21,10 @@ pub mod ply;
 pub mod scene;
 
 mod charts;
+mod estimate;
 mod gltf_file;
 mod material;
+mod named_file;
 mod obj_file;
 mod open;
 mod output;
@@ -30,10 +34,11 @@ mod trace;
 
 pub use crate::image::{Channel, LayeredImage, Precision, ToneMap, Window, read_environment, write_png};
 pub use camera::Camera;
+pub use cloud::{CloudOptions, Facing, InvalidPoints, Radius};
 pub use error::PointsError;
 pub use gbuffer::{GBuffer, GBufferChannels};
 pub use light::{Light, LightKind};
-pub use open::{BoxedPointStream, Density, SampleOptions, open_input};
-pub use ply::write_point_ply;
+pub use open::{Density, Input, InputOptions, SampleOptions, open_input, origin_of};
+pub use ply::{PlyForm, write_point_ply};
 pub use sample::MeshPoints;
 pub use scene::MeshScene;

@@ -16,6 +16,12 @@ pub const LIGHT_CHUNK_POINTS: usize = 1024;
 /// Threads that light points or trace primary rays, unless the caller says otherwise.
 pub const THREADS_DEFAULT: usize = 2;
 
+/// Memory for what an input keeps, unless the caller says otherwise.
+pub const INPUT_MEMORY_DEFAULT: u64 = 2 << 30;
+
+/// Least memory that brings a cloud into order: two blocks at work, and the counts of coarse cells.
+pub const ESTIMATE_MEMORY_MIN: u64 = 8_000_000;
+
 /// Most channels of an EXR file.
 pub const EXR_CHANNELS_MAX: usize = 64;
 
@@ -37,11 +43,23 @@ pub const PLY_LINE_BYTES_MAX: usize = 1 << 16;
 /// Most elements in a list property that is skipped.
 pub const PLY_LIST_MAX: u64 = 1 << 20;
 
+/// Most channels of a PTC file.
+pub const PTC_CHANNELS_MAX: i32 = 256;
+
+/// Longest line that names a channel of a PTC file.
+pub const PTC_LINE_BYTES_MAX: u64 = 1 << 10;
+
 /// Most bytes of a mesh file or one of its buffers.
 pub const MESH_FILE_BYTES_MAX: u64 = 8 << 30;
 
 /// Deepest node hierarchy of a mesh file: a cycle would have no end.
 pub const NODE_DEPTH_MAX: usize = 256;
+
+/// Memory of a triangle at its peak, while charts and BVHs are made (measured on the dragon), vertices not counted.
+pub const TRIANGLE_BYTES: usize = 400;
+
+/// Memory of a placed mesh, its share of the BVH over all of them included.
+pub const INSTANCE_BYTES: usize = 500;
 
 /// Most placed meshes in a scene.
 pub const INSTANCES_MAX: usize = 1 << 22;

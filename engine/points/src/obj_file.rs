@@ -2,10 +2,13 @@
 
 use crate::error::PointsError;
 use crate::material::{Material, Texture, TextureSlot, Wrap};
+use crate::named_file::beside;
 use crate::scene::{Geometry, Instance, SceneParts};
 use crate::texture_file::decode;
 use glam::DAffine3;
+use std::cell::Cell;
 use std::collections::BTreeMap;
+use std::io::BufReader;
 use std::path::Path;
 
 /// Albedo of faces without a material.
@@ -13,8 +16,8 @@ const GREY: [f32; 3] = [0.8; 3];
 
 /// Reads a file and the materials and textures that it names.
 pub(crate) fn read(path: &Path) -> Result<SceneParts, PointsError> {
-    // Opened first for the system's own words: tobj says only that it failed.
-    std::fs::File::open(path).map_err(PointsError::io("open", path))?;
+    // Opened here for the system's own words: tobj says only that it failed.
+    let file = std::fs::File::open(path).map_err(PointsError::io("open", path))?;
     let options = tobj::LoadOptions {
         single_index: true,
         triangulate: true,
@@ -22,7 +25,19 @@ pub(crate) fn read(path: &Path) -> Result<SceneParts, PointsError> {
         ignore_lines: true,
     };
     let damaged = |error: tobj::LoadError| PointsError::invalid(path, format!("not a usable OBJ file: {error}"));
-    let (models, materials) = tobj::load_obj(path, &options).map_err(damaged)?;
+    let outside = Cell::new(None);
+    let library = |name: &Path| match beside(path, &name.to_string_lossy()) {
+        Ok(library) => tobj::load_mtl(library),
+        Err(error) => {
+            outside.set(Some(error));
+            Err(tobj::LoadError::OpenFileFailed)
+        }
+    };
+    let loaded = tobj::load_obj_buf(&mut BufReader::new(file), &options, library);
+    if let Some(error) = outside.take() {
+        return Err(error);
+    }
+    let (models, materials) = loaded.map_err(damaged)?;
     let materials = materials.map_err(|error| {
         let what = format!("its material library cannot be read ({error}): copy it beside, or delete the line mtllib");
         PointsError::invalid(path, what)
@@ -125,7 +140,7 @@ fn texture(
     }
     // Options before the name, and Windows' separators.
     let last = name.trim().replace('\\', "/");
-    let file = path.parent().unwrap_or(Path::new("")).join(&last);
+    let file = beside(path, &last)?;
     let bytes = std::fs::read(&file).map_err(|error| {
         let what = format!("texture {file:?} is named but cannot be read ({error}): copy it beside the scene");
         PointsError::invalid(path, what)

@@ -92,10 +92,30 @@ impl MeshScene {
     /// # Errors
     /// As [`Self::load`], for the first file that cannot be read.
     pub fn load_all(paths: &[&Path]) -> Result<Self, PointsError> {
+        Self::load_within(paths, u64::MAX)
+    }
+
+    /// As [`Self::load_all`], with a bound on the memory that the scene takes while it is read and indexed.
+    ///
+    /// # Errors
+    /// As [`Self::load`]; [`PointsError::Memory`] with what is needed.
+    pub fn load_within(paths: &[&Path], memory_bytes: u64) -> Result<Self, PointsError> {
         let mut all = SceneParts::default();
+        let fits = |needed: u64| match needed <= memory_bytes {
+            true => Ok(()),
+            false => Err(PointsError::Memory {
+                what: "the geometry",
+                needed,
+                available: memory_bytes,
+            }),
+        };
         for path in paths {
+            let before = all.memory_bytes();
+            // What is not there is reported by its reader.
+            let length = std::fs::metadata(path).map_or(0, |metadata| metadata.len());
+            fits(before.saturating_add(length))?;
             let parts = match crate::open::extension(path).as_str() {
-                "gltf" | "glb" => gltf_file::read(path)?,
+                "gltf" | "glb" => gltf_file::read(path, &|bytes| fits(before.saturating_add(bytes)))?,
                 "obj" => obj_file::read(path)?,
                 other => {
                     let what = format!("a mesh of kind {other:?}");
@@ -108,6 +128,7 @@ impl MeshScene {
             };
             parts.check(path)?;
             all.append(parts);
+            fits(all.memory_bytes())?;
         }
         Ok(Self::from_parts(all))
     }
@@ -184,6 +205,11 @@ impl MeshScene {
         })
     }
 
+    /// Bytes that it takes at its peak, while it is indexed.
+    pub fn memory_bytes(&self) -> u64 {
+        memory_bytes(&self.geometries, &self.instances, &self.textures)
+    }
+
     pub(crate) fn tracer(&self) -> &Tracer {
         &self.tracer
     }
@@ -233,7 +259,24 @@ impl MeshScene {
     }
 }
 
+/// Bytes of a scene at its peak, while its charts and BVHs are made.
+fn memory_bytes(geometries: &[Geometry], instances: &[Instance], textures: &[Texture]) -> u64 {
+    let bytes = |geometry: &Geometry| {
+        let vertices = size_of_val(&geometry.positions[..])
+            + size_of_val(&geometry.normals[..])
+            + geometry.uvs.iter().map(|uvs| size_of_val(&uvs[..])).sum::<usize>();
+        vertices + geometry.triangles.len() * limits::TRIANGLE_BYTES
+    };
+    let geometry: usize = geometries.iter().map(bytes).sum();
+    let textures: usize = textures.iter().map(|texture| size_of_val(&texture.texels[..])).sum();
+    (geometry + textures + instances.len() * limits::INSTANCE_BYTES) as u64
+}
+
 impl SceneParts {
+    fn memory_bytes(&self) -> u64 {
+        memory_bytes(&self.geometries, &self.instances, &self.textures)
+    }
+
     fn append(&mut self, mut other: Self) {
         let (geometries, materials, textures) = (self.geometries.len(), self.materials.len(), self.textures.len());
         for geometry in &mut other.geometries {

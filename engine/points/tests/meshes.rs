@@ -370,3 +370,47 @@ fn the_leaves_of_the_tree_are_cut_out_of_their_cards() {
         );
     }
 }
+
+#[test]
+fn names_that_leave_the_folder_of_the_scene_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir(folder.path().join("in")).unwrap();
+    fs::write(folder.path().join("out.bin"), [0u8; 64]).unwrap();
+    fs::write(folder.path().join("out.mtl"), "newmtl m\n").unwrap();
+    let gltf = folder.path().join("in/a.gltf");
+    for uri in ["../out.bin", "%2e%2e/out.bin", "/etc/hostname"] {
+        let text = format!(
+            r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[]}}],"buffers":[{{"uri":"{uri}","byteLength":4}}]}}"#
+        );
+        fs::write(&gltf, text).unwrap();
+        assert_says(
+            MeshScene::load(&gltf).map(drop),
+            &["leaves the scene's folder", "put that file beside", "a.gltf"],
+        );
+    }
+    let obj = folder.path().join("in/a.obj");
+    fs::write(&obj, "mtllib ../out.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+    assert_says(MeshScene::load(&obj).map(drop), &["leaves the scene's folder", "a.obj"]);
+}
+
+#[test]
+fn geometry_that_exceeds_the_memory_is_refused_with_what_it_needs() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("demo.glb");
+    pbgi_points::demo::write_glb(&path).unwrap();
+    let scene = MeshScene::load(&path).unwrap();
+    let needed = scene.memory_bytes();
+    assert!(MeshScene::load_within(&[&path], needed).is_ok());
+    let refused = MeshScene::load_within(&[&path], needed - 1).map(drop);
+    assert_says(
+        refused,
+        &["not enough memory", "geometry", &needed.to_string(), "--memory"],
+    );
+    // Before it is read at all.
+    assert_says(
+        MeshScene::load_within(&[&path], 1000).map(drop),
+        &["1000 bytes are available"],
+    );
+    // Two files need both.
+    assert!(MeshScene::load_within(&[&path, &path], needed + needed / 2).is_err());
+}

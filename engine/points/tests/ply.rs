@@ -8,7 +8,7 @@ use common::{assert_says, collect, mutate};
 use pbgi_core::point::Sides;
 use pbgi_core::{PointRecord, PointStream};
 use pbgi_points::ply::{PlyPoints, PlyWriter};
-use pbgi_points::{Density, PointsError, SampleOptions, open_input, write_point_ply};
+use pbgi_points::{CloudOptions, Density, InputOptions, PlyForm, PointsError, open_input, write_point_ply};
 use std::fs;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -28,7 +28,7 @@ fn write(folder: &Path, parts: &[&[u8]]) -> PathBuf {
 }
 
 fn read(path: &Path) -> Result<Vec<PointRecord>, PointsError> {
-    let mut stream = PlyPoints::open(path)?;
+    let mut stream = PlyPoints::open(path, [0.0; 3], &CloudOptions::default())?;
     let mut points = Vec::new();
     while stream.next_batch(&mut points)? {}
     Ok(points)
@@ -61,7 +61,7 @@ fn ascii_and_both_binary_encodings_give_the_same_points() {
         ("binary_big_endian", &big),
     ] {
         let path = write(folder.path(), &[&header(format, rows.len(), HEADER), body]);
-        let mut stream = PlyPoints::open(&path).unwrap();
+        let mut stream = PlyPoints::open(&path, [0.0; 3], &CloudOptions::default()).unwrap();
         assert_eq!(stream.len_hint(), Some(40_000));
         let points = collect(&mut stream);
         stream.rewind().unwrap();
@@ -114,12 +114,7 @@ fn an_empty_cloud_is_valid() {
 #[test]
 fn missing_properties_are_named_with_a_remedy() {
     let folder = tempfile::tempdir().unwrap();
-    for (missing, remedy) in [
-        ("x", "position"),
-        ("ny", "estimate normals"),
-        ("radius", "add the radius"),
-        ("green", "all three"),
-    ] {
+    for (missing, remedy) in [("x", "position"), ("ny", "all three"), ("green", "all three")] {
         let kept: String = HEADER
             .split_inclusive('\n')
             .filter(|line| line.trim_end().rsplit(' ').next() != Some(missing))
@@ -129,6 +124,18 @@ fn missing_properties_are_named_with_a_remedy() {
             read(&path),
             &[&format!("property {missing} is missing"), remedy, "cloud.ply"],
         );
+    }
+    for (missing, says, remedy) in [
+        ("n", "no normals", "--estimate-normals"),
+        ("radius", "no radius", "--radius auto"),
+    ] {
+        let kept: String = HEADER
+            .split_inclusive('\n')
+            .filter(|line| !line.starts_with(&format!("property float {missing}")))
+            .collect();
+        let path = write(folder.path(), &[&header("ascii", 0, &kept)]);
+        let opened = open_input(&[path], &InputOptions::default());
+        assert_says(opened.map(drop), &[says, remedy, "cloud.ply"]);
     }
     assert_says(read(&folder.path().join("none.ply")), &["cannot open", "none.ply"]);
 }
@@ -240,7 +247,7 @@ fn written_points_are_read_back_with_both_sides() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("out.ply");
     let ours = points(50);
-    let mut writer = PlyWriter::create(&path, &["occlusion"]).unwrap();
+    let mut writer = PlyWriter::create(&path, PlyForm::Floats, &["occlusion"]).unwrap();
     ours.iter().for_each(|point| writer.push(point, &[0.5]).unwrap());
     assert!(fs::metadata(&path).is_err(), "nothing appears before it is whole");
     assert_eq!(writer.finish().unwrap(), 50);
@@ -252,8 +259,8 @@ fn written_points_are_read_back_with_both_sides() {
     }
     let copy = folder.path().join("copy.ply");
     let mut seen = 0;
-    let mut stream = PlyPoints::open(&path).unwrap();
-    let count = write_point_ply(&copy, &mut stream, &mut |points| {
+    let mut stream = PlyPoints::open(&path, [0.0; 3], &CloudOptions::default()).unwrap();
+    let count = write_point_ply(&copy, PlyForm::Floats, &mut stream, &mut |points| {
         seen = points;
         ControlFlow::Continue(())
     });
@@ -265,12 +272,12 @@ fn written_points_are_read_back_with_both_sides() {
 fn a_cancelled_or_failed_writing_leaves_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let input = folder.path().join("in.ply");
-    let mut writer = PlyWriter::create(&input, &[]).unwrap();
+    let mut writer = PlyWriter::create(&input, PlyForm::Floats, &[]).unwrap();
     points(10).iter().for_each(|point| writer.push(point, &[]).unwrap());
     writer.finish().unwrap();
     let output = folder.path().join("out.ply");
-    let mut stream = PlyPoints::open(&input).unwrap();
-    let stopped = write_point_ply(&output, &mut stream, &mut |_| ControlFlow::Break(()));
+    let mut stream = PlyPoints::open(&input, [0.0; 3], &CloudOptions::default()).unwrap();
+    let stopped = write_point_ply(&output, PlyForm::Floats, &mut stream, &mut |_| ControlFlow::Break(()));
     assert!(matches!(stopped, Err(PointsError::Cancelled)));
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
 }
@@ -279,22 +286,22 @@ fn a_cancelled_or_failed_writing_leaves_nothing() {
 fn inputs_of_several_kinds_make_one_stream() {
     let folder = tempfile::tempdir().unwrap();
     let cloud = folder.path().join("cloud.PLY");
-    let mut writer = PlyWriter::create(&cloud, &[]).unwrap();
+    let mut writer = PlyWriter::create(&cloud, PlyForm::Floats, &[]).unwrap();
     points(10).iter().for_each(|point| writer.push(point, &[]).unwrap());
     writer.finish().unwrap();
     let room = folder.path().join("room.glb");
     pbgi_points::demo::write_glb(&room).unwrap();
-    let options = SampleOptions {
+    let options = InputOptions {
         density: Density::Points(5000),
-        ..SampleOptions::default()
+        ..InputOptions::default()
     };
-    let alone = collect(&mut *open_input(std::slice::from_ref(&room), &options).unwrap()).len();
+    let alone = collect(&mut open_input(std::slice::from_ref(&room), &options).unwrap()).len();
     let mut both = open_input(&[cloud, room], &options).unwrap();
     assert_eq!(both.len_hint(), Some(5010));
-    let all = collect(&mut *both);
+    let all = collect(&mut both);
     assert_eq!(all.len(), alone + 10);
     both.rewind().unwrap();
-    assert_eq!(collect(&mut *both), all);
+    assert_eq!(collect(&mut both), all);
     let kind = PathBuf::from("scene.fbx");
     assert_says(
         open_input(&[kind], &options).map(drop),

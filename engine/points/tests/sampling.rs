@@ -7,7 +7,7 @@ mod common;
 use common::{GltfScene, assert_says, collect, png_uri, sample, shared};
 use glam::Vec3;
 use pbgi_core::{PointRecord, PointStream};
-use pbgi_points::{Density, MeshPoints, MeshScene, SampleOptions, open_input};
+use pbgi_points::{Density, InputOptions, MeshPoints, MeshScene, SampleOptions, open_input};
 use serde_json::json;
 use std::collections::HashMap;
 use std::f32::consts::PI;
@@ -141,15 +141,16 @@ fn sampling_is_the_same_every_time_whatever_the_threads_and_after_rewind() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("demo.glb");
     pbgi_points::demo::write_glb(&path).unwrap();
-    let options = |threads| SampleOptions {
+    let options = |threads| InputOptions {
         density: Density::Points(60_000),
         threads,
+        ..InputOptions::default()
     };
     let mut stream = open_input(std::slice::from_ref(&path), &options(2)).unwrap();
-    let first = collect(&mut *stream);
+    let first = collect(&mut stream);
     stream.rewind().unwrap();
-    assert_eq!(first, collect(&mut *stream));
-    assert_eq!(first, collect(&mut *open_input(&[path], &options(1)).unwrap()));
+    assert_eq!(first, collect(&mut stream));
+    assert_eq!(first, collect(&mut open_input(&[path], &options(1)).unwrap()));
 }
 
 #[test]
@@ -352,7 +353,7 @@ fn sponza_gives_two_hundred_thousand_lit_points_with_its_masks_cut_out() {
     let mut document: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
     for list in ["images", "buffers"] {
         for entry in document[list].as_array_mut().unwrap() {
-            entry["uri"] = json!(path.with_file_name(entry["uri"].as_str().unwrap()));
+            entry["uri"] = json!(format!("sponza/{}", entry["uri"].as_str().unwrap()));
         }
     }
     for material in document["materials"].as_array_mut().unwrap() {
@@ -360,6 +361,7 @@ fn sponza_gives_two_hundred_thousand_lit_points_with_its_masks_cut_out() {
         material.as_object_mut().unwrap().remove("alphaCutoff");
     }
     let folder = tempfile::tempdir().unwrap();
+    std::os::unix::fs::symlink(path.parent().unwrap(), folder.path().join("sponza")).unwrap();
     let opaque = folder.path().join("opaque.gltf");
     std::fs::write(&opaque, document.to_string()).unwrap();
     let whole = sample(MeshScene::load(&opaque).unwrap(), Density::Points(200_000));

@@ -5,6 +5,7 @@ use crate::error::JobError;
 use crate::job::{BuildTask, Density, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
 use crate::shade_job::Counters;
 use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
+use pbgi_points::{CloudOptions, Facing, InvalidPoints, Radius};
 use pbgi_proto::v1;
 
 pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Request, JobError> {
@@ -19,6 +20,7 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
                 Some(v1::build_task::Density::Spacing(spacing)) => Density::Spacing(spacing),
                 Some(v1::build_task::Density::Points(points)) => Density::Points(points),
             },
+            cloud: cloud(task.cloud.unwrap_or_default())?,
         })),
         Some(v1::submit_job_request::Task::Shade(task)) => Ok(Request::Shade(ShadeTask {
             scene: task.scene.into(),
@@ -46,6 +48,38 @@ pub(super) fn options(options: Option<v1::JobOptions>, caller: &str) -> JobOptio
         after: given.after,
         paused: given.paused,
     }
+}
+
+fn cloud(given: v1::CloudSettings) -> Result<CloudOptions, JobError> {
+    let estimate_normals = match given.estimate_normals.map(v1::Facing::try_from) {
+        None => None,
+        Some(Ok(v1::Facing::Auto)) => Some(Facing::Auto),
+        Some(Ok(v1::Facing::Up)) => Some(Facing::Up),
+        Some(Ok(v1::Facing::Outward)) => Some(Facing::Outward),
+        Some(Ok(v1::Facing::Viewpoint)) => Some(Facing::Viewpoint(triple("viewpoint", &given.viewpoint)?)),
+        Some(Err(unknown)) => return Err(JobError::invalid(format!("estimate_normals is {unknown}"))),
+    };
+    Ok(CloudOptions {
+        origin: match &given.origin[..] {
+            [] => None,
+            origin => Some(triple("origin", origin)?),
+        },
+        invalid_points: match given.skip_invalid_points {
+            true => InvalidPoints::Skip,
+            false => InvalidPoints::Refuse,
+        },
+        recompute_bounds: given.recompute_bounds,
+        estimate_normals,
+        radius: given.radius.and_then(|radius| match radius {
+            v1::cloud_settings::Radius::EstimateRadius(estimate) => estimate.then_some(Radius::Estimate),
+            v1::cloud_settings::Radius::FixedRadius(radius) => Some(Radius::Fixed(radius)),
+        }),
+    })
+}
+
+fn triple<T: Copy>(name: &str, numbers: &[T]) -> Result<[T; 3], JobError> {
+    let wrong = |_| JobError::invalid(format!("{name} has {} numbers, must have 3", numbers.len()));
+    numbers.try_into().map_err(wrong)
 }
 
 fn build_settings(settings: Option<v1::BuildSettings>) -> BuildSettings {

@@ -7,7 +7,7 @@ use pbgi_cache::channel::{self, PageOutcome, PageReply, PageRequest, Welcome};
 use pbgi_cache::{CacheView, LocalCache};
 use pbgi_core::point::Sides;
 use pbgi_core::{MountId, PageKey, PageKind, PageNo, PointRecord};
-use pbgi_points::ply::PlyWriter;
+use pbgi_points::ply::{PlyForm, PlyWriter};
 use pbgi_points::{GBuffer, LayeredImage, Window};
 use pbgi_proto::v1;
 use pbgi_proto::v1::complete_tile_request::Outcome;
@@ -181,7 +181,7 @@ fn values(receivers: &[u8]) -> Vec<u8> {
 }
 
 fn write_cloud(path: &Path, count: u32) {
-    let mut writer = PlyWriter::create(path, &[]).unwrap();
+    let mut writer = PlyWriter::create(path, PlyForm::Floats, &[]).unwrap();
     let sides = Sides {
         front: [1.0; 3],
         back: [0.0; 3],

@@ -2,6 +2,7 @@
 
 use crate::error::PointsError;
 use crate::limits;
+use crate::named_file::beside;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -144,13 +145,13 @@ pub(super) fn read_uri(path: &Path, uri: &str) -> Result<Vec<u8>, PointsError> {
         let what = format!("the URI {uri:?}");
         return Err(PointsError::unsupported(path, what, "put the file beside the scene"));
     }
-    let file = resolve(path, uri);
+    let file = resolve(path, uri)?;
     read_bytes(path, &file)
 }
 
 /// Where a relative URI points to.
-pub(super) fn resolve(path: &Path, uri: &str) -> PathBuf {
-    path.parent().unwrap_or(Path::new("")).join(decode_percent(uri))
+pub(super) fn resolve(path: &Path, uri: &str) -> Result<PathBuf, PointsError> {
+    beside(path, &decode_percent(uri))
 }
 
 fn read_bytes(scene: &Path, path: &Path) -> Result<Vec<u8>, PointsError> {

@@ -110,7 +110,7 @@ impl Loader<'_> {
                 let source = if uri.starts_with("data:") {
                     self.path.to_owned()
                 } else {
-                    resolve(self.path, uri)
+                    resolve(self.path, uri)?
                 };
                 decode(&source, &read_uri(self.path, uri)?)?
             }

@@ -20,9 +20,11 @@ use std::path::Path;
 /// Meshes whose placed triangles are fewer than this are copied into the world rather than placed: one BVH is faster.
 const COPIED_TRIANGLES_MAX: usize = 100_000;
 
-/// Reads a file and all that it names.
-pub(crate) fn read(path: &Path) -> Result<SceneParts, PointsError> {
+/// Reads a file and all that it names, if its buffers' bytes are what `fits` lets pass.
+pub(crate) fn read(path: &Path, fits: &dyn Fn(u64) -> Result<(), PointsError>) -> Result<SceneParts, PointsError> {
     let (document, blob) = buffers::open(path)?;
+    let bytes = document.as_json().buffers.iter().map(|buffer| buffer.byte_length.0);
+    fits(bytes.fold(0, u64::saturating_add))?;
     let buffers = buffers::load(path, &document, blob)?;
     let visited = nodes::visit(path, &document)?;
     let (materials, textures) = materials::load(path, &document, &buffers)?;

@@ -1,7 +1,9 @@
 //! PLY headers: which numbers a vertex has, and where they lie.
 
+use super::BOUNDS_COMMENT;
 use crate::error::PointsError;
 use crate::limits;
+use pbgi_core::Bounds;
 use std::io::{BufRead, Read};
 use std::path::Path;
 
@@ -52,6 +54,8 @@ pub(super) struct Header {
     pub(super) elements: Vec<Element>,
     /// Bytes of the header, where the data start.
     pub(super) bytes: u64,
+    /// The box that a file of ours declares in a comment.
+    pub(super) bounds: Option<Bounds>,
 }
 
 impl Encoding {
@@ -73,7 +77,7 @@ impl Encoding {
 }
 
 impl Scalar {
-    fn parse(name: &str) -> Option<Self> {
+    pub(super) fn parse(name: &str) -> Option<Self> {
         Some(match name {
             "char" | "int8" => Self::I8,
             "uchar" | "uint8" => Self::U8,
@@ -148,6 +152,7 @@ impl Header {
             encoding: Encoding::Ascii,
             elements: Vec::new(),
             bytes: 0,
+            bounds: None,
         };
         let mut limited = reader.take(limits::PLY_HEADER_BYTES_MAX);
         let mut has_format = false;
@@ -174,6 +179,7 @@ impl Header {
             match words.as_slice() {
                 ["end_header"] if has_format => return Ok(header),
                 ["ply"] if number == 1 => {}
+                ["comment", BOUNDS_COMMENT, numbers @ ..] => header.bounds = parse_bounds(numbers),
                 ["comment" | "obj_info", ..] | [] => {}
                 ["format", name, "1.0"] => {
                     has_format = true;
@@ -222,6 +228,16 @@ impl Property {
             kind,
         })
     }
+}
+
+/// Six numbers and nothing else.
+fn parse_bounds(words: &[&str]) -> Option<Bounds> {
+    let numbers: Result<Vec<f32>, _> = words.iter().map(|word| word.parse()).collect();
+    let [a, b, c, d, e, f] = numbers.ok()?.try_into().ok()?;
+    Some(Bounds {
+        min: [a, b, c],
+        max: [d, e, f],
+    })
 }
 
 fn bad_line(path: &Path, number: usize, line: &str) -> PointsError {

@@ -1,10 +1,14 @@
 //! The reading side: [`PlyPoints`].
 
-use super::header::{Element, Encoding, Header, PropertyKind, Scalar};
+use super::RECORD_PROPERTIES;
+use super::header::{Element, Encoding, Header, Property, PropertyKind, Scalar};
+use crate::cloud::{
+    Cloud, CloudOptions, Door, Missing, NORMAL_PLACEHOLDER, RADIUS_PLACEHOLDER, linear_from_srgb, relative,
+};
 use crate::error::PointsError;
 use crate::limits;
 use pbgi_core::point::Sides;
-use pbgi_core::{Bounds, PointRecord, PointStream};
+use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -17,37 +21,56 @@ pub struct PlyPoints {
     /// Elements that lie before the vertices.
     before: Vec<Element>,
     vertex: Element,
-    columns: Columns,
+    form: Form,
     data_start: u64,
-    /// Index of the next point.
-    next: u64,
-    /// Whether the reader stands at point `next`.
+    /// The box that our own writer declares.
+    declared: Option<Bounds>,
+    origin: [f64; 3],
+    /// Whether the reader stands at the next point.
     positioned: bool,
+    door: Door,
     buffer: Vec<u8>,
     values: Vec<f64>,
 }
 
+/// What a vertex looks like.
+enum Form {
+    /// Our own record, byte for byte.
+    Records,
+    Fields(Box<Fields>),
+}
+
 /// Where the numbers of a point are among the properties of a vertex.
-struct Columns {
-    position: [usize; 3],
-    normal: [usize; 3],
-    radius: usize,
+struct Fields {
+    position: [Field; 3],
+    normal: Option<[Field; 3]>,
+    radius: Option<Field>,
     front: Option<Colour>,
     back: Option<Colour>,
+    encoding: Encoding,
+}
+
+/// One property.
+#[derive(Clone, Copy)]
+struct Field {
+    column: usize,
+    /// In bytes, where vertices are binary.
+    offset: usize,
+    scalar: Scalar,
 }
 
 struct Colour {
-    columns: [usize; 3],
+    fields: [Field; 3],
     /// The value of white, where the numbers are sRGB.
-    white: [Option<f64>; 3],
+    white: Option<f64>,
 }
 
 impl PlyPoints {
-    /// Opens a file and checks its header, and for binary files its length.
+    /// Opens a file and checks its header, and for binary files its length. Positions are taken relative to `origin`.
     ///
     /// # Errors
-    /// No or a damaged file, or one that lacks positions, normals or radii.
-    pub fn open(path: &Path) -> Result<Self, PointsError> {
+    /// No or a damaged file, or one that lacks positions.
+    pub fn open(path: &Path, origin: [f64; 3], options: &CloudOptions) -> Result<Self, PointsError> {
         let file = File::open(path).map_err(PointsError::io("open", path))?;
         let length = file.metadata().map_err(PointsError::io("read", path))?.len();
         let mut reader = BufReader::with_capacity(1 << 18, file);
@@ -69,16 +92,31 @@ impl PlyPoints {
                 "write single numbers",
             ));
         }
+        let form = if header.encoding == Encoding::LittleEndian && is_record(&vertex.properties) {
+            Form::Records
+        } else {
+            let mut fields = Fields::find(path, &vertex, header.encoding)?;
+            if options.estimate_normals.is_some() {
+                fields.normal = None;
+            }
+            Form::Fields(Box::new(fields))
+        };
+        let moved = |bounds: Bounds| Bounds {
+            min: relative(bounds.min.map(f64::from), origin),
+            max: relative(bounds.max.map(f64::from), origin),
+        };
         Ok(Self {
-            columns: Columns::find(path, &vertex)?,
+            form,
             path: path.to_owned(),
             reader,
             encoding: header.encoding,
             before,
-            vertex,
             data_start: header.bytes,
-            next: 0,
+            declared: header.bounds.filter(|_| !options.recompute_bounds).map(moved),
+            origin,
             positioned: false,
+            door: Door::new(path, vertex.count, options.invalid_points),
+            vertex,
             buffer: Vec::new(),
             values: Vec::new(),
         })
@@ -166,50 +204,57 @@ impl PlyPoints {
                     words.by_ref().take(items).for_each(drop);
                 }
             }
-            let point = self.columns.point(&self.values).map_err(|error| self.invalid(error))?;
-            batch.push(point);
-            self.next += 1;
+            if let Form::Fields(fields) = &self.form {
+                let point = fields.point(self.origin, |field| self.values[field.column]);
+                self.door.take(point, batch);
+            }
         }
         Ok(())
     }
 
     fn next_binary(&mut self, count: usize, batch: &mut Vec<PointRecord>) -> Result<(), PointsError> {
-        let stride = self.vertex.stride().unwrap_or_default();
+        let stride = self.vertex.stride().unwrap_or_default().max(1);
         self.buffer.resize(stride * count, 0);
         let mut buffer = std::mem::take(&mut self.buffer);
         self.reader.read_exact(&mut buffer).map_err(self.short())?;
-        for bytes in buffer.chunks_exact(stride.max(1)) {
-            self.values.clear();
-            let mut rest = bytes;
-            for property in &self.vertex.properties {
-                if let PropertyKind::Scalar(scalar) = property.kind {
-                    self.values.push(scalar.decode(rest, self.encoding));
-                    rest = &rest[scalar.size()..];
+        let (vertices, origin) = (buffer.chunks_exact(stride), self.origin);
+        match &self.form {
+            Form::Records => {
+                for vertex in vertices {
+                    let mut point: PointRecord = bytemuck::pod_read_unaligned(vertex);
+                    point.position = relative(point.position.map(f64::from), origin);
+                    self.door.take(point.validate().map(|()| point), batch);
                 }
             }
-            let point = self.columns.point(&self.values).map_err(|error| self.invalid(error))?;
-            batch.push(point);
-            self.next += 1;
+            Form::Fields(fields) if fields.are_little_floats() => {
+                for vertex in vertices {
+                    let float = |field: &Field| f64::from(little_float(&vertex[field.offset..]));
+                    self.door.take(fields.point(origin, float), batch);
+                }
+            }
+            Form::Fields(fields) => {
+                for vertex in vertices {
+                    let number = |field: &Field| field.scalar.decode(&vertex[field.offset..], fields.encoding);
+                    self.door.take(fields.point(origin, number), batch);
+                }
+            }
         }
         self.buffer = buffer;
         Ok(())
     }
 
-    fn invalid(&self, error: pbgi_core::InvalidPoint) -> PointsError {
-        PointsError::point(&self.path, self.next, self.vertex.count, error)
-    }
-
     fn bad_number(&self, property: &str, found: &str) -> PointsError {
         PointsError::InvalidPoint {
-            index: self.next,
+            index: self.door.seen(),
             count: self.vertex.count,
             reason: format!("property {property} is not a number: {found:?}"),
+            invalid: 1,
             path: self.path.clone(),
         }
     }
 
     fn ended(&self) -> PointsError {
-        let (next, count) = (self.next, self.vertex.count);
+        let (next, count) = (self.door.seen(), self.vertex.count);
         PointsError::invalid(
             &self.path,
             format!("file is truncated: expected {count} points, found {next}"),
@@ -230,7 +275,10 @@ impl PointStream for PlyPoints {
     type Error = PointsError;
 
     fn bounds(&self) -> Option<Bounds> {
-        (self.vertex.count == 0).then_some(Bounds::EMPTY)
+        match self.vertex.count {
+            0 => Some(Bounds::EMPTY),
+            _ => self.declared,
+        }
     }
 
     fn len_hint(&self) -> Option<u64> {
@@ -238,8 +286,9 @@ impl PointStream for PlyPoints {
     }
 
     fn next_batch(&mut self, batch: &mut Vec<PointRecord>) -> Result<bool, PointsError> {
-        let left = self.vertex.count - self.next;
+        let left = self.vertex.count - self.door.seen();
         if left == 0 {
+            self.door.close()?;
             return Ok(false);
         }
         if !self.positioned {
@@ -254,10 +303,30 @@ impl PointStream for PlyPoints {
     }
 
     fn rewind(&mut self) -> Result<(), PointsError> {
-        self.next = 0;
+        self.door.rewind();
         self.positioned = false;
         let start = self.reader.seek(SeekFrom::Start(self.data_start));
         start.map(drop).map_err(PointsError::io("read", &self.path))
+    }
+}
+
+impl Cloud for PlyPoints {
+    fn path(&self) -> &Path {
+        &self.path
+    }
+
+    fn missing(&self) -> Missing {
+        match &self.form {
+            Form::Records => Missing::default(),
+            Form::Fields(fields) => Missing {
+                normals: fields.normal.is_none(),
+                radii: fields.radius.is_none(),
+            },
+        }
+    }
+
+    fn skipped(&self) -> u64 {
+        self.door.skipped()
     }
 }
 
@@ -302,89 +371,114 @@ fn check_length(path: &Path, header: &Header, vertex: usize, length: u64) -> Res
     Ok(())
 }
 
-impl Columns {
-    fn find(path: &Path, vertex: &Element) -> Result<Self, PointsError> {
+impl Fields {
+    fn find(path: &Path, vertex: &Element, encoding: Encoding) -> Result<Self, PointsError> {
         let find = |name: &str| {
-            vertex
-                .properties
-                .iter()
-                .position(|p| p.name == name && matches!(p.kind, PropertyKind::Scalar(_)))
+            let mut offset = 0;
+            for (column, property) in vertex.properties.iter().enumerate() {
+                // Vertices with lists are read as text, where offsets do not matter.
+                if let PropertyKind::Scalar(scalar) = property.kind {
+                    if property.name == name {
+                        return Some(Field { column, offset, scalar });
+                    }
+                    offset += scalar.size();
+                }
+            }
+            None
         };
-        let need = |name: &str, remedy: &str| {
-            find(name).ok_or_else(|| {
-                let names: Vec<&str> = vertex.properties.iter().map(|p| p.name.as_str()).collect();
-                let found = names.join(", ");
-                PointsError::invalid(
-                    path,
-                    format!("property {name} is missing (there are: {found}): {remedy}"),
-                )
-            })
-        };
-        let axes = |names: [&str; 3], remedy: &str| -> Result<[usize; 3], PointsError> {
-            Ok([
-                need(names[0], remedy)?,
-                need(names[1], remedy)?,
-                need(names[2], remedy)?,
-            ])
+        // All three of a kind or none.
+        let triple = |names: [&str; 3]| -> Result<Option<[Field; 3]>, PointsError> {
+            match names.map(find) {
+                [Some(a), Some(b), Some(c)] => Ok(Some([a, b, c])),
+                [None, None, None] => Ok(None),
+                some => {
+                    let missing = names.iter().zip(&some).find(|(_, field)| field.is_none());
+                    let names: Vec<&str> = vertex.properties.iter().map(|p| p.name.as_str()).collect();
+                    let what = format!(
+                        "property {} is missing (there are: {}): a position, normal or colour has all three numbers",
+                        missing.map_or("", |(name, _)| name),
+                        names.join(", ")
+                    );
+                    Err(PointsError::invalid(path, what))
+                }
+            }
         };
         let colour = |names: [&str; 3]| -> Result<Option<Colour>, PointsError> {
-            if names.iter().all(|name| find(name).is_none()) {
-                return Ok(None);
-            }
-            let columns = axes(names, "a colour needs all three channels")?;
-            let white = columns.map(|column| match vertex.properties[column].kind {
-                PropertyKind::Scalar(scalar) => Scalar::white(scalar),
-                PropertyKind::List { .. } => None,
-            });
-            Ok(Some(Colour { columns, white }))
+            Ok(triple(names)?.map(|fields| Colour {
+                fields,
+                white: fields[0].scalar.white(),
+            }))
         };
+        let position = triple(["x", "y", "z"])?;
         Ok(Self {
-            position: axes(["x", "y", "z"], "every point needs a position")?,
-            normal: axes(
-                ["nx", "ny", "nz"],
-                "estimate normals first, for example with CloudCompare or MeshLab",
-            )?,
-            radius: need(
-                "radius",
-                "add the radius of each point's disc, about 0.56 of the distance between points",
-            )?,
+            position: position
+                .ok_or_else(|| PointsError::invalid(path, "property x is missing: every point needs a position"))?,
+            normal: triple(["nx", "ny", "nz"])?,
+            radius: find("radius"),
             front: colour(["red", "green", "blue"])?,
             back: colour(["back_red", "back_green", "back_blue"])?,
+            encoding,
         })
     }
 
-    fn point(&self, values: &[f64]) -> Result<PointRecord, pbgi_core::InvalidPoint> {
-        let take = |columns: [usize; 3]| columns.map(|column| values[column] as f32);
-        let colour = |colour: &Option<Colour>| colour.as_ref().map_or([0.0; 3], |colour| colour.decode(values));
-        let sides = Sides {
-            front: colour(&self.front),
-            back: colour(&self.back),
+    fn are_little_floats(&self) -> bool {
+        let triples = [Some(self.position), self.normal];
+        let colours = [&self.front, &self.back]
+            .into_iter()
+            .flatten()
+            .map(|colour| colour.fields);
+        let mut fields = triples
+            .into_iter()
+            .flatten()
+            .chain(colours)
+            .flatten()
+            .chain(self.radius);
+        self.encoding == Encoding::LittleEndian && fields.all(|field| field.scalar == Scalar::F32)
+    }
+
+    #[inline]
+    fn point(&self, origin: [f64; 3], number: impl Fn(&Field) -> f64) -> Result<PointRecord, InvalidPoint> {
+        let position = relative([0, 1, 2].map(|axis| number(&self.position[axis])), origin);
+        let normal = match &self.normal {
+            Some(fields) => [0, 1, 2].map(|axis| number(&fields[axis]) as f32),
+            None => NORMAL_PLACEHOLDER,
         };
-        PointRecord::new(
-            take(self.position),
-            take(self.normal),
-            values[self.radius] as f32,
-            sides,
-        )
+        let radius = self
+            .radius
+            .as_ref()
+            .map_or(RADIUS_PLACEHOLDER, |field| number(field) as f32);
+        let colour = |colour: &Option<Colour>| {
+            colour.as_ref().map_or([0.0; 3], |Colour { fields, white }| {
+                [0, 1, 2].map(|channel| match white {
+                    Some(white) => linear_from_srgb(number(&fields[channel]) / white) as f32,
+                    None => number(&fields[channel]) as f32,
+                })
+            })
+        };
+        let front = colour(&self.front);
+        // Which side of a point without a normal is lit is not known.
+        let back = match (&self.back, &self.normal) {
+            (None, None) => front,
+            (back, _) => colour(back),
+        };
+        PointRecord::new(position, normal, radius, Sides { front, back })
     }
 }
 
-impl Colour {
-    fn decode(&self, values: &[f64]) -> [f32; 3] {
-        std::array::from_fn(|channel| {
-            let value = values[self.columns[channel]];
-            match self.white[channel] {
-                Some(white) => linear_from_srgb(value / white) as f32,
-                None => value as f32,
-            }
-        })
-    }
+#[inline]
+fn little_float(bytes: &[u8]) -> f32 {
+    let mut word = [0; size_of::<f32>()];
+    word.copy_from_slice(&bytes[..size_of::<f32>()]);
+    f32::from_le_bytes(word)
 }
 
-fn linear_from_srgb(encoded: f64) -> f64 {
-    if encoded <= 0.040_45 {
-        encoded / 12.92
-    } else {
-        ((encoded + 0.055) / 1.055).powf(2.4)
-    }
+fn is_record(properties: &[Property]) -> bool {
+    let names = properties
+        .iter()
+        .map(|property| (property.name.as_str(), property.kind));
+    names.eq(RECORD_PROPERTIES.map(|(kind, name)| {
+        // Every type of the table has a name.
+        let scalar = Scalar::parse(kind).unwrap_or(Scalar::F64);
+        (name, PropertyKind::Scalar(scalar))
+    }))
 }

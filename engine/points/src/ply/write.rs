@@ -1,14 +1,15 @@
 //! The writing side: [`PlyWriter`] and [`write_point_ply`].
 
+use super::{BOUNDS_COMMENT, RECORD_PROPERTIES};
 use crate::error::PointsError;
 use crate::output::OutputFile;
-use pbgi_core::{PointRecord, PointStream};
+use pbgi_core::{Bounds, PointRecord, PointStream};
 use std::io::{self, Seek, SeekFrom, Write};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-/// Numbers of a point, in file order.
-const PROPERTIES: [&str; 13] = [
+/// Numbers of a point of [`PlyForm::Floats`], in file order.
+const FLOAT_PROPERTIES: [&str; 13] = [
     "x",
     "y",
     "z",
@@ -24,12 +25,23 @@ const PROPERTIES: [&str; 13] = [
     "back_blue",
 ];
 
+/// How points are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlyForm {
+    /// 13 floats, 52 bytes: for any tool that reads PLY.
+    Floats,
+    /// The 32 bytes of a point record: what a build reads fastest, without loss.
+    Records,
+}
+
 /// A binary little-endian PLY file of points whose number is not known before. It appears when it is finished.
 pub struct PlyWriter {
     path: PathBuf,
     file: OutputFile,
+    form: PlyForm,
     extra: Vec<String>,
     count: u64,
+    bounds: Bounds,
     row: Vec<u8>,
 }
 
@@ -38,12 +50,14 @@ impl PlyWriter {
     ///
     /// # Errors
     /// The file cannot be made.
-    pub fn create(path: &Path, extra: &[&str]) -> Result<Self, PointsError> {
+    pub fn create(path: &Path, form: PlyForm, extra: &[&str]) -> Result<Self, PointsError> {
         let mut writer = Self {
             path: path.to_owned(),
             file: OutputFile::create(path)?,
+            form,
             extra: extra.iter().map(|&name| name.to_owned()).collect(),
             count: 0,
+            bounds: Bounds::EMPTY,
             row: Vec::new(),
         };
         writer.write_header().map_err(PointsError::io("write", path))?;
@@ -59,24 +73,28 @@ impl PlyWriter {
     /// If the number of extra values is not that of the names: a bug of the caller.
     pub fn push(&mut self, point: &PointRecord, extra: &[f32]) -> Result<(), PointsError> {
         assert_eq!(extra.len(), self.extra.len(), "a value for every extra property");
-        let (normal, sides) = (point.normal().to_array(), point.sides());
         self.row.clear();
-        let numbers = [
-            &point.position[..],
-            &normal,
-            &[point.radius],
-            &sides.front,
-            &sides.back,
-            extra,
-        ];
-        for number in numbers.into_iter().flatten() {
-            self.row.extend_from_slice(&number.to_le_bytes());
+        match self.form {
+            PlyForm::Records => self.row.extend_from_slice(bytemuck::bytes_of(point)),
+            PlyForm::Floats => {
+                let (normal, sides) = (point.normal().to_array(), point.sides());
+                let numbers = [&point.position[..], &normal, &[point.radius], &sides.front, &sides.back];
+                let bytes = numbers.into_iter().flatten().flat_map(|number| number.to_le_bytes());
+                self.row.extend(bytes);
+            }
         }
+        self.row.extend(extra.iter().flat_map(|number| number.to_le_bytes()));
         self.file
             .write_all(&self.row)
             .map_err(PointsError::io("write", &self.path))?;
         self.count += 1;
+        self.bounds.include(point.position);
         Ok(())
+    }
+
+    /// Points so far.
+    pub fn count(&self) -> u64 {
+        self.count
     }
 
     /// Completes the file; the number of points.
@@ -92,15 +110,31 @@ impl PlyWriter {
         Ok(self.count)
     }
 
-    /// The header has the same length whatever the count: a comment takes up the difference.
+    /// The header has the same length whatever the count and the box: a comment takes up the difference.
     fn write_header(&mut self) -> io::Result<()> {
-        const DIGITS: usize = 20;
+        /// Digits of the largest count, and characters of six floats in their shortest exact form.
+        const VARIABLE_CHARS: usize = 20 + 6 * 15;
         let count = self.count.to_string();
-        let padding = "-".repeat(DIGITS - count.len().min(DIGITS));
+        let mut bounds = String::new();
+        if !self.bounds.is_empty() {
+            for number in self.bounds.min.iter().chain(&self.bounds.max) {
+                bounds += &format!(" {number:e}");
+            }
+        }
+        let padding = "-".repeat(VARIABLE_CHARS.saturating_sub(count.len() + bounds.len()));
         let mut header = format!(
-            "ply\nformat binary_little_endian 1.0\ncomment made by pbgi, radiance is linear {padding}\nelement vertex {count}\n"
+            "ply\nformat binary_little_endian 1.0\ncomment made by pbgi, radiance is linear {padding}\n\
+             comment {BOUNDS_COMMENT}{bounds}\nelement vertex {count}\n"
         );
-        for name in PROPERTIES.into_iter().chain(self.extra.iter().map(String::as_str)) {
+        match self.form {
+            PlyForm::Floats => FLOAT_PROPERTIES
+                .iter()
+                .for_each(|name| header += &format!("property float {name}\n")),
+            PlyForm::Records => RECORD_PROPERTIES
+                .iter()
+                .for_each(|(kind, name)| header += &format!("property {kind} {name}\n")),
+        }
+        for name in &self.extra {
             header += &format!("property float {name}\n");
         }
         header += "end_header\n";
@@ -115,13 +149,14 @@ impl PlyWriter {
 /// Those of the stream, a failing disk, or [`PointsError::Cancelled`]; there is no file then.
 pub fn write_point_ply<S>(
     path: &Path,
+    form: PlyForm,
     stream: &mut S,
     observer: &mut dyn FnMut(u64) -> ControlFlow<()>,
 ) -> Result<u64, PointsError>
 where
     S: PointStream<Error = PointsError> + ?Sized,
 {
-    let mut writer = PlyWriter::create(path, &[])?;
+    let mut writer = PlyWriter::create(path, form, &[])?;
     let mut batch = Vec::new();
     while stream.next_batch(&mut batch)? {
         batch.iter().try_for_each(|point| writer.push(point, &[]))?;
