@@ -1,5 +1,6 @@
 //! The build child: reads a spec on standard input, builds, and tells how it goes on standard output, a JSON object a line.
 
+use crate::confine::{Confine, confine};
 use crate::job::Density;
 use crate::limits;
 use nix::sys::prctl::set_pdeathsig;
@@ -42,6 +43,8 @@ pub struct Spec {
     pub data_limit_bytes: u64,
     /// Who started this; the child ends with it.
     pub daemon_pid: u32,
+    /// What it may use of the disk; `None` for what its user may.
+    pub confine: Option<Confine>,
 }
 
 /// A line of the child.
@@ -112,6 +115,9 @@ fn obey_the_daemon(spec: &Spec) -> Result<(), String> {
 }
 
 fn build_scene(spec: &Spec) -> Result<Statistics, String> {
+    if let Some(directories) = &spec.confine {
+        confine(directories)?;
+    }
     let cancelled = cancel_flag()?;
     let default = InputOptions::default();
     let options = InputOptions {

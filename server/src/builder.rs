@@ -1,16 +1,19 @@
 //! A build's life in the daemon: a child process does the work, so that a crash, a hostile file or too much memory costs one job.
 
 use crate::build_child::{Report, Spec};
+use crate::confine::Confine;
 use crate::dispatcher::Dispatcher;
+use crate::error::JobError;
 use crate::job::BuildTask;
 use crate::limits;
+use crate::roots::Want;
 use crate::scheduler::JobNo;
 use crate::supervisor::BuildChild;
 use pbgi_core::Statistics;
 use pbgi_store::{OsVolume, sweep_scratch, sweep_temporaries};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::ExitStatusExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{ChildStderr, ChildStdout, ExitStatus};
 use std::sync::Arc;
 use tokio::sync::watch;
@@ -31,18 +34,7 @@ pub async fn run(
         permit = dispatcher.work_memory.acquire_many(megabytes) => permit.map_err(|error| error.to_string())?,
         _ = abort.wait_for(|stop| *stop) => return Err("stopped".into()),
     };
-    let spec = Spec {
-        inputs: task.inputs.clone(),
-        output: task.output.clone(),
-        overwrite: task.overwrite,
-        settings: task.settings,
-        density: task.density,
-        cloud: task.cloud,
-        scratch_dir: dispatcher.config.options.scratch_dir.clone(),
-        memory_bytes: memory.build_bytes,
-        data_limit_bytes: memory.total_bytes,
-        daemon_pid: std::process::id(),
-    };
+    let spec = spec(dispatcher, task).map_err(|error| error.text)?;
     let started = dispatcher.supervisor.build(job.0).await;
     let child = started.map_err(|error| format!("cannot start a build process: {error}"))?;
     dispatcher.build_started(job, child.pid);
@@ -64,11 +56,57 @@ pub async fn run(
             if let Err(error) = swept.await {
                 tracing::error!(%error, "sweep after a failed build panicked");
             }
-            return Err(error);
+            return Err(hide(dispatcher, task, error));
         }
     };
     statistics.peak_memory_bytes = Some(dispatcher.peaks(job).0 as f64);
     Ok(statistics)
+}
+
+/// What the child must know; its paths are real ones, and it is kept to their roots.
+fn spec(dispatcher: &Dispatcher, task: &BuildTask) -> Result<Spec, JobError> {
+    let (memory, roots) = (&dispatcher.config.memory, &dispatcher.roots);
+    let scratch_dir = dispatcher.config.options.scratch_dir.clone();
+    let real = |path: &PathBuf| roots.real(path, Want::Read);
+    let real_root = |path: &PathBuf| roots.root_of(path).map(|(root, _)| root);
+    let output = roots.real(&task.output, Want::output(task.overwrite))?;
+    let confine = (!roots.is_empty()).then(|| Confine {
+        read: task.inputs.iter().filter_map(real_root).collect(),
+        write: output
+            .parent()
+            .map(Path::to_owned)
+            .into_iter()
+            .chain([scratch_dir.clone()])
+            .collect(),
+    });
+    Ok(Spec {
+        inputs: task.inputs.iter().map(real).collect::<Result<_, _>>()?,
+        output,
+        overwrite: task.overwrite,
+        settings: task.settings,
+        density: task.density,
+        cloud: task.cloud,
+        scratch_dir,
+        memory_bytes: memory.build_bytes,
+        data_limit_bytes: memory.total_bytes,
+        daemon_pid: std::process::id(),
+        confine,
+    })
+}
+
+/// Real paths of a task as the client knows them.
+fn hide(dispatcher: &Dispatcher, task: &BuildTask, text: String) -> String {
+    let mut text = text;
+    for (real, name) in task
+        .inputs
+        .iter()
+        .chain([&task.output])
+        .filter_map(|path| dispatcher.roots.root_of(path))
+    {
+        let real = format!("{}/", real.to_string_lossy().trim_end_matches('/'));
+        text = text.replace(&real, &format!("{name}:"));
+    }
+    text
 }
 
 fn sweep(output: &Path, scratch: &Path) {

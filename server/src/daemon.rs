@@ -6,6 +6,7 @@ use crate::error::ServerError;
 use crate::limits;
 use crate::loader::{Loader, cache_seat};
 use crate::mounts::Mounts;
+use crate::roots::Roots;
 use crate::rpc;
 use crate::scheduler::{Death, Seat};
 use crate::state::StateDir;
@@ -16,12 +17,13 @@ use pbgi_cache::{CacheOwner, Segment};
 use pbgi_store::{OsVolume, sweep_scratch};
 use std::fs;
 use std::io;
+use std::net::SocketAddr;
 use std::os::unix::fs::{PermissionsExt, chown as std_chown};
 use std::os::unix::net::{UnixListener as StdUnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
-use tokio::net::UnixListener;
+use tokio::net::{TcpListener, UnixListener};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
@@ -30,6 +32,7 @@ use tokio::task::JoinHandle;
 pub struct Listeners {
     jobs: UnixListener,
     queue: UnixListener,
+    tcp: Option<TcpListener>,
     /// Names to remove in the end: those that we made.
     made: Vec<PathBuf>,
 }
@@ -59,7 +62,11 @@ impl Listeners {
         };
         let queue = bind(&queue_path, None)?;
         made.push(queue_path);
-        Ok(Self { jobs, queue, made })
+        let tcp = match &config.options.access.tcp {
+            Some(tcp) => Some(bind_tcp(tcp.address)?),
+            None => None,
+        };
+        Ok(Self { jobs, queue, tcp, made })
     }
 }
 
@@ -88,6 +95,17 @@ fn bind(path: &Path, group: Option<Gid>) -> Result<UnixListener, ServerError> {
     };
     protected.map_err(ServerError::io("protect a socket", path))?;
     Ok(listener)
+}
+
+fn bind_tcp(address: SocketAddr) -> Result<TcpListener, ServerError> {
+    let bound = std::net::TcpListener::bind(address).and_then(|listener| {
+        listener.set_nonblocking(true)?;
+        TcpListener::from_std(listener)
+    });
+    bound.map_err(|error| ServerError::Setup {
+        action: "listen on TCP",
+        reason: format!("{error}, at {address}"),
+    })
 }
 
 /// How far the daemon is told to stop.
@@ -141,6 +159,13 @@ async fn run_daemon(
     stop: &mut watch::Receiver<Stop>,
 ) -> Result<(), ServerError> {
     sweep(config, state)?;
+    let remote = config
+        .options
+        .access
+        .tcp
+        .as_ref()
+        .map(|tcp| rpc::Remote::new(&tcp.auth))
+        .transpose()?;
     let name = Segment::unique_name()?;
     state.note_segment(&name)?;
     let segment = Segment::create(&name, &config.layout).inspect_err(|_| state.forget_segment())?;
@@ -149,10 +174,18 @@ async fn run_daemon(
     let (dispatcher, supervisor) = start(config, cache, Arc::new(table)).inspect_err(|_| unlink(&name, state))?;
     dispatcher.restore(rows, rpc::stored_request);
     let (ending, ended) = watch::channel(false);
-    let servers = [
+    let mut servers = vec![
         tokio::spawn(rpc::serve_jobs(listeners.jobs, dispatcher.clone(), ended.clone())),
-        tokio::spawn(rpc::serve_queue(listeners.queue, dispatcher.clone(), ended)),
+        tokio::spawn(rpc::serve_queue(listeners.queue, dispatcher.clone(), ended.clone())),
     ];
+    if let (Some(listener), Some(remote)) = (listeners.tcp, remote) {
+        servers.push(tokio::spawn(rpc::serve_tcp(
+            listener,
+            remote,
+            dispatcher.clone(),
+            ended,
+        )));
+    }
     tracing::info!(
         version = env!("CARGO_PKG_VERSION"),
         pid = std::process::id(),
@@ -223,6 +256,7 @@ fn start(
         queue_socket: options.queue_socket(),
         server_binary: options.server_binary.clone(),
     };
+    let roots = Roots::open(&options.access.roots)?;
     let mut made = None;
     let runtime = tokio::runtime::Handle::current();
     let (handle, _) = Supervisor::start(plan, |supervisor| {
@@ -233,6 +267,7 @@ fn start(
             mounts.clone(),
             supervisor.clone(),
             table,
+            roots,
             runtime,
         );
         let dispatcher = made.insert(Arc::new(dispatcher)).clone();

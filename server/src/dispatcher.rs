@@ -5,6 +5,7 @@
 
 mod clients;
 mod durable;
+mod live;
 mod upkeep;
 
 pub use clients::{DaemonStatus, Submission};
@@ -14,7 +15,9 @@ use crate::error::{JobError, JobErrorKind};
 use crate::framebuffer::TileReceivers;
 use crate::job::{JobState, JobStatus, Request};
 use crate::limits;
+use crate::live::Live;
 use crate::mounts::Mounts;
+use crate::roots::Roots;
 use crate::scheduler::{Death, Effect, End, Event, JobNo, LeaseId, Scheduler, Seat};
 use crate::shade_job::{self, Counters, Shading};
 use crate::supervisor::{Handle, WorkerBirth};
@@ -35,6 +38,7 @@ pub struct Dispatcher {
     pub(crate) mounts: Arc<Mounts>,
     pub(crate) supervisor: Handle,
     pub(crate) table: Arc<JobTable>,
+    pub(crate) roots: Roots,
     /// Mebibytes of the work share that are free.
     pub(crate) work_memory: Arc<Semaphore>,
     /// One picture is read at a time: how large it is shows only then.
@@ -50,6 +54,7 @@ pub struct Dispatcher {
 struct State {
     scheduler: Scheduler,
     jobs: BTreeMap<JobNo, Record>,
+    lives: BTreeMap<JobNo, Live>,
     names: HashMap<String, JobNo>,
     /// Ended jobs, oldest first.
     ended: VecDeque<JobNo>,
@@ -140,11 +145,13 @@ impl Dispatcher {
         mounts: Arc<Mounts>,
         supervisor: Handle,
         table: Arc<JobTable>,
+        roots: Roots,
         runtime: tokio::runtime::Handle,
     ) -> Self {
         let state = State {
             scheduler: Scheduler::default(),
             jobs: BTreeMap::new(),
+            lives: BTreeMap::new(),
             names: HashMap::new(),
             ended: VecDeque::new(),
             failed: VecDeque::new(),
@@ -164,6 +171,7 @@ impl Dispatcher {
             mounts,
             supervisor,
             table,
+            roots,
             runtime,
             wake: Notify::new(),
             stop: watch::Sender::new(false),
@@ -297,6 +305,13 @@ impl Dispatcher {
     fn ended(&self, state: &mut State, job: JobNo, end: End) {
         self.cache.end_job(job.0);
         state.active = Instant::now();
+        if let Some(live) = state.lives.remove(&job) {
+            if let End::Failed(error) = end {
+                // It has room for one more than there are tiles; a client that left does not listen.
+                let _ = live.results.try_send(Err(error));
+            }
+            return;
+        }
         let unmet = match &end {
             End::Unmet(before) => state.jobs.get(before).map(|record| record.status.borrow().id.clone()),
             _ => None,
@@ -423,9 +438,15 @@ impl Dispatcher {
         let Effect::Grant { lease, job, tile, .. } = granted else {
             return None;
         };
-        let record = state.jobs.get(&job)?;
-        let receivers = record.shading.as_ref()?.frame.receivers(tile);
-        let span = tracing::debug_span!(parent: &record.span, "tile", tile, lease = lease.0, slot = seat.slot, epoch = seat.epoch);
+        let (receivers, parent) = match (state.lives.get(&job), state.jobs.get(&job)) {
+            (Some(live), _) => (live.tiles.get(&tile)?.clone(), Span::none()),
+            (None, record) => {
+                let record = record?;
+                (record.shading.as_ref()?.frame.receivers(tile), record.span.clone())
+            }
+        };
+        let span =
+            tracing::debug_span!(parent: &parent, "tile", tile, lease = lease.0, slot = seat.slot, epoch = seat.epoch);
         let work = Work { lease, job, tile, span };
         if let Some(sitting) = state.seats.get_mut(usize::from(seat.slot))?.as_mut() {
             sitting.work = Some(work);
@@ -453,15 +474,8 @@ impl Dispatcher {
         match outcome {
             TileOutcome::Failure(text) => failure = Some(text),
             TileOutcome::Values { values, counters } => {
-                let shading = work
-                    .as_ref()
-                    .and_then(|work| state.jobs.get(&work.job)?.shading.as_ref());
-                let checked = match (shading, &work) {
-                    (Some(shading), Some(work)) => shading.frame.check(work.tile, &values),
-                    // The lease ended, as the scheduler knows.
-                    _ => Ok(()),
-                };
-                match checked {
+                // Without work the lease has ended, as the scheduler knows.
+                match work.as_ref().map_or(Ok(()), |work| state.check(work, &values)) {
                     Ok(()) => result = Some((values, counters)),
                     Err(text) => failure = Some(format!("the worker's answer is wrong: {text}")),
                 }
@@ -480,6 +494,14 @@ impl Dispatcher {
     /// The job is over.
     pub fn task(&self, job: JobNo) -> Result<TaskInfo, JobError> {
         let state = self.lock();
+        if let Some(live) = state.lives.get(&job) {
+            return Ok(TaskInfo {
+                scene: live.mounted.scene().info().clone(),
+                mount: live.mounted.id(),
+                settings: live.settings,
+                environment: live.environment.clone(),
+            });
+        }
         let record = state.jobs.get(&job);
         match record.and_then(|record| Some((record.shading.as_ref()?, &*record.request))) {
             Some((shading, Request::Shade(task))) => Ok(TaskInfo {
@@ -504,6 +526,15 @@ impl Dispatcher {
 }
 
 impl State {
+    /// Checks a tile's values against what was asked for.
+    fn check(&self, work: &Work, values: &[u8]) -> Result<(), String> {
+        if let Some(live) = self.lives.get(&work.job) {
+            return live.check(work.tile, values);
+        }
+        let shading = self.jobs.get(&work.job).and_then(|record| record.shading.as_ref());
+        shading.map_or(Ok(()), |shading| shading.frame.check(work.tile, values))
+    }
+
     /// Adds a line to a job's history.
     fn note(&self, job: JobNo, text: String) {
         if let Some(record) = self

@@ -129,6 +129,8 @@ pub enum JobErrorKind {
     Corrupt,
     /// The caller is not who it must be.
     Unauthenticated,
+    /// The caller may not do this.
+    Denied,
     /// The daemon is stopping or cannot work.
     Unavailable,
     /// A bug.

@@ -2,6 +2,7 @@
 
 use crate::error::{JobError, JobErrorKind};
 use crate::limits;
+use crate::roots::{Roots, Want};
 use crate::scheduler::{JobNo, Kind};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
 use pbgi_points::CloudOptions;
@@ -71,7 +72,7 @@ impl Request {
     ///
     /// # Errors
     /// [`JobErrorKind::Invalid`], naming the field.
-    pub fn validate(&self) -> Result<(), JobError> {
+    pub fn validate(&self, roots: &Roots) -> Result<(), JobError> {
         let invalid = |error: pbgi_core::SettingsError| JobError::invalid(error.to_string());
         match self {
             Self::Build(task) => {
@@ -90,18 +91,21 @@ impl Request {
                     Density::Points(0) => return Err(JobError::invalid("points is 0, must be above 0")),
                     _ => {}
                 }
-                task.inputs.iter().try_for_each(|path| check_path("input", path))
+                task.inputs
+                    .iter()
+                    .try_for_each(|path| roots.check("input", path, Want::Read))?;
+                roots.check("output", &task.output, Want::output(task.overwrite))
             }
             Self::Shade(task) => {
                 task.settings.validate().map_err(invalid)?;
-                check_path("scene", &task.scene)?;
-                check_path("gbuffer", &task.gbuffer)?;
+                roots.check("scene", &task.scene, Want::Read)?;
+                roots.check("gbuffer", &task.gbuffer, Want::Read)?;
+                roots.check("output", &task.output, Want::output(task.overwrite))?;
                 task.environment
                     .iter()
-                    .try_for_each(|path| check_path("environment", path))
+                    .try_for_each(|path| roots.check("environment", path, Want::Read))
             }
-        }?;
-        check_path("output", self.output())
+        }
     }
 
     /// Where the result goes.
@@ -130,25 +134,6 @@ impl Request {
             },
         }
     }
-}
-
-/// Checks a path that a client names.
-pub(crate) fn check_path(field: &str, path: &Path) -> Result<(), JobError> {
-    let bytes = path.as_os_str().as_encoded_bytes();
-    let wrong = if bytes.is_empty() {
-        "is empty"
-    } else if !path.is_absolute() {
-        "is not absolute"
-    } else if bytes.contains(&0) {
-        "has a zero byte"
-    } else if bytes.len() > limits::PATH_BYTES_MAX {
-        "is too long"
-    } else if path.file_name().is_none() {
-        "names no file"
-    } else {
-        return Ok(());
-    };
-    Err(JobError::invalid(format!("{field} path {wrong}: {}", path.display())))
 }
 
 /// Checks a client's name for a job.
@@ -325,7 +310,7 @@ mod tests {
             density: Density::Default,
             cloud: CloudOptions::default(),
         };
-        Request::Build(good.clone()).validate().unwrap();
+        Request::Build(good.clone()).validate(&Roots::default()).unwrap();
         type Change = fn(&mut BuildTask);
         let cases: [(Change, &str); 6] = [
             (|task| task.inputs.clear(), "0 inputs"),
@@ -338,7 +323,7 @@ mod tests {
         for (change, text) in cases {
             let mut task = good.clone();
             change(&mut task);
-            let error = Request::Build(task).validate().unwrap_err();
+            let error = Request::Build(task).validate(&Roots::default()).unwrap_err();
             assert!(error.text.contains(text), "{error}");
         }
     }

@@ -30,6 +30,10 @@ pub const TABLE_CACHE_BYTES: usize = 4 << 20;
 pub const TABLE_SLACK_BYTES_MAX: u64 = 64 << 20;
 /// Input files of a build.
 pub const BUILD_INPUTS_MAX: usize = 1_024;
+/// Parts of a path below a root.
+pub const PATH_PARTS_MAX: usize = 32;
+/// Time that a TLS handshake may take.
+pub const HANDSHAKE_MAX: Duration = Duration::from_secs(5);
 /// Bytes of a path.
 pub const PATH_BYTES_MAX: usize = 4_096;
 /// Tiles of a picture.
@@ -61,6 +65,13 @@ pub const LEASE_WAIT: Duration = Duration::from_secs(5);
 /// Columns of the environment map that workers get; larger maps are averaged down. A raster of 64 x 64 cells over a
 /// hemicube has cells of 1.4 degrees, a map of this width pixels of 0.7.
 pub const ENVIRONMENT_WIDTH_MAX: u32 = 512;
+
+/// Clients that stream receivers at once.
+pub const LIVE_SESSIONS_MAX: usize = 64;
+/// Tiles of a stream that are neither waiting to be read nor answered: enough for 64 workers at once.
+pub const LIVE_TILES_MAX: usize = 64;
+/// Bytes of a message of a stream: 170 tiles.
+pub const LIVE_MESSAGE_BYTES_MAX: usize = 4 << 20;
 
 /// Time between two looks at leases, idle time and memory.
 pub const TICK: Duration = Duration::from_millis(200);

@@ -163,6 +163,33 @@ impl Mounts {
         state.seats.iter().flatten().map(status).collect()
     }
 
+    /// Unmounts a scene; whether it was mounted.
+    ///
+    /// # Errors
+    /// A job uses it.
+    pub fn close(&self, path: &Path) -> Result<bool, JobError> {
+        // A scene that is gone from the disk may still be mounted under the name it had.
+        let path = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        let mut state = self.lock();
+        let named = |seat: &Option<Entry>| seat.as_ref().is_some_and(|entry| entry.mount.path == path);
+        let Some(slot) = state.seats.iter().position(named) else {
+            return Ok(false);
+        };
+        // As in `let_go`: one owner means that nobody else has it or can get it.
+        if state.seats[slot]
+            .as_ref()
+            .is_some_and(|entry| Arc::strong_count(&entry.mount) > 1)
+        {
+            let text = "the scene is in use; try again when its jobs have ended";
+            return Err(JobError::new(JobErrorKind::Precondition, text));
+        }
+        if let Some(entry) = state.seats[slot].take() {
+            self.cache.unmount(entry.mount.id);
+            tracing::info!(slot, path = %path.display(), "scene dropped");
+        }
+        Ok(true)
+    }
+
     /// Unmounts what nobody uses: other builds of the path that is being opened, and the longest unused of too many.
     fn let_go(&self, state: &mut Seats, replaced: Option<&Path>) {
         // `get` hands out clones under this very lock, so one owner means that nobody else has it or can get it.

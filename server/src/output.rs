@@ -2,6 +2,7 @@
 
 use crate::framebuffer::Planes;
 use crate::job::ShadeTask;
+use crate::roots::Place;
 use pbgi_core::{BuildId, Statistics};
 use pbgi_points::{LayeredImage, Precision};
 use pbgi_store::{AtomicFile, Overwrite, StoreError};
@@ -19,6 +20,8 @@ pub struct Picture {
     pub statistics: Statistics,
     /// Where the file is encoded before it goes beside its target.
     pub scratch: PathBuf,
+    /// Its target.
+    pub place: Place,
 }
 
 /// Writes the picture; returns its bytes.
@@ -32,8 +35,8 @@ pub fn write(picture: &Picture, planes: Planes, stopped: &dyn Fn() -> bool) -> R
     } else {
         Overwrite::Refuse
     };
-    let text = |error: StoreError| error.to_string();
-    let mut file = AtomicFile::create(&task.output, overwrite).map_err(text)?;
+    let text = |error: StoreError| picture.place.hide(&error.to_string());
+    let mut file = AtomicFile::create(&picture.place.path, overwrite).map_err(text)?;
     let image = layered(picture, planes);
     let encoded = Encoded(picture.scratch.join(format!("picture-{}.exr", unique())));
     image.write_exr(&encoded.0).map_err(|error| error.to_string())?;
@@ -126,6 +129,7 @@ fn name(path: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::roots::Roots;
     use pbgi_core::ShadeSettings;
     use pbgi_points::Window;
 
@@ -146,6 +150,7 @@ mod tests {
                 ..Statistics::default()
             },
             scratch: folder.to_owned(),
+            place: Roots::default().write(&folder.join("out.exr"), overwrite).unwrap(),
         }
     }
 

@@ -1,36 +1,50 @@
 //! The edge: gRPC in, plain types onward. The only place that knows tonic.
 //!
-//! Two sockets that are never mixed: clients' ([`serve_jobs`]) and workers' ([`serve_queue`]).
+//! Listeners that are never mixed: clients' ([`serve_jobs`], and [`serve_tcp`] if configured) and workers' ([`serve_queue`], on a
+//! Unix socket only).
 
 mod accept;
 mod convert;
+mod gate;
 mod jobs;
+mod live;
 mod queue;
 pub mod status;
 
+use crate::access::Auth;
 use crate::dispatcher::Dispatcher;
 use crate::error::{JobError, ServerError};
 use crate::job::Request;
 use crate::limits;
-use accept::{check_peer, connections};
+use accept::{Connection, connections};
+use gate::Gate;
 use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_server::DaemonServiceServer;
 use pbgi_proto::v1::job_service_server::JobServiceServer;
 use pbgi_proto::v1::queue_service_server::QueueServiceServer;
 use pbgi_proto::v1::scene_service_server::SceneServiceServer;
+use pbgi_proto::v1::shade_service_server::ShadeServiceServer;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::net::UnixListener;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpListener, UnixListener};
 use tokio::sync::watch;
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::service::InterceptorLayer;
-use tonic::transport::Server;
+use tonic::transport::server::Connected;
+use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tonic_health::ServingStatus;
 
 /// How long a request may take that is no stream.
 const REQUEST_MAX: Duration = Duration::from_secs(30);
 
 /// Services that clients see, by name.
-const CLIENT_SERVICES: [&str; 3] = ["pbgi.v1.JobService", "pbgi.v1.SceneService", "pbgi.v1.DaemonService"];
+const CLIENT_SERVICES: [&str; 4] = [
+    "pbgi.v1.JobService",
+    "pbgi.v1.SceneService",
+    "pbgi.v1.ShadeService",
+    "pbgi.v1.DaemonService",
+];
 
 fn server() -> Server {
     Server::builder()
@@ -44,16 +58,79 @@ fn server() -> Server {
         .http2_max_header_list_size(limits::HEADER_BYTES_MAX)
 }
 
-/// Serves clients until `stop` becomes true.
+/// Serves clients on this machine until `stop` becomes true.
 ///
 /// # Errors
 /// The server cannot be set up or fails as a whole.
 pub async fn serve_jobs(
     listener: UnixListener,
     dispatcher: Arc<Dispatcher>,
-    mut stop: watch::Receiver<bool>,
+    stop: watch::Receiver<bool>,
 ) -> Result<(), ServerError> {
+    let gate = Gate::users(&dispatcher.config.options.access);
+    serve_clients(server(), gate, connections(listener), dispatcher, stop).await
+}
+
+/// How clients over TCP are served, with its secrets read.
+pub struct Remote {
+    server: Server,
+    gate: Gate,
+}
+
+impl Remote {
+    /// Reads certificates, key and token.
+    ///
+    /// # Errors
+    /// One that is missing, unusable, or readable by others.
+    pub fn new(auth: &Auth) -> Result<Self, ServerError> {
+        let gate = Gate::remote(auth)?;
+        let Auth::MutualTls {
+            cert, key, client_ca, ..
+        } = auth
+        else {
+            return Ok(Self { server: server(), gate });
+        };
+        let read = |path: &std::path::PathBuf| {
+            std::fs::read_to_string(path).map_err(ServerError::io("read a certificate", path))
+        };
+        let tls = ServerTlsConfig::new()
+            .identity(Identity::from_pem(read(cert)?, gate::read_secret(key)?))
+            .client_ca_root(Certificate::from_pem(read(client_ca)?))
+            .client_auth_optional(false)
+            .timeout(limits::HANDSHAKE_MAX);
+        let server = server().tls_config(tls).map_err(|error| ServerError::Setup {
+            action: "set up TLS",
+            reason: format!("{error:?}, with {} and {}", cert.display(), client_ca.display()),
+        })?;
+        Ok(Self { server, gate })
+    }
+}
+
+/// Serves clients over TCP until `stop` becomes true.
+///
+/// # Errors
+/// The server cannot be set up or fails as a whole.
+pub async fn serve_tcp(
+    listener: TcpListener,
+    remote: Remote,
+    dispatcher: Arc<Dispatcher>,
+    stop: watch::Receiver<bool>,
+) -> Result<(), ServerError> {
+    serve_clients(remote.server, remote.gate, connections(listener), dispatcher, stop).await
+}
+
+async fn serve_clients<S>(
+    server: Server,
+    gate: Gate,
+    incoming: ReceiverStream<std::io::Result<Connection<S>>>,
+    dispatcher: Arc<Dispatcher>,
+    mut stop: watch::Receiver<bool>,
+) -> Result<(), ServerError>
+where
+    S: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
     let service = jobs::Jobs::new(dispatcher.clone());
+    let live = live::LiveShading::new(dispatcher.clone());
     let limit = limits::JOBS_MESSAGE_BYTES_MAX;
     let (health, health_service) = tonic_health::server::health_reporter();
     let mut healthy = dispatcher.health();
@@ -85,8 +162,8 @@ pub async fn serve_jobs(
         action: "set up reflection",
         reason: error.to_string(),
     };
-    let served = server()
-        .layer(InterceptorLayer::new(check_peer))
+    let served = server
+        .layer(InterceptorLayer::new(move |request| gate.check(request)))
         .add_service(health_service)
         .add_service(reflection().build_v1().map_err(setup)?)
         // Python's reflection client speaks this one only.
@@ -98,7 +175,12 @@ pub async fn serve_jobs(
         )
         .add_service(SceneServiceServer::new(service.clone()).max_decoding_message_size(limit))
         .add_service(DaemonServiceServer::new(service).max_decoding_message_size(limit))
-        .serve_with_incoming_shutdown(connections(listener), async move {
+        .add_service(
+            ShadeServiceServer::new(live)
+                .max_decoding_message_size(limits::LIVE_MESSAGE_BYTES_MAX)
+                .max_encoding_message_size(limits::LIVE_MESSAGE_BYTES_MAX),
+        )
+        .serve_with_incoming_shutdown(incoming, async move {
             // An error means that the daemon is gone.
             let _ = stop.wait_for(|stop| *stop).await;
         })
@@ -118,8 +200,9 @@ pub async fn serve_queue(
 ) -> Result<(), ServerError> {
     let limit = limits::QUEUE_MESSAGE_BYTES_MAX;
     let service = QueueServiceServer::new(queue::Queue::new(dispatcher));
+    let gate = Gate::own();
     server()
-        .layer(InterceptorLayer::new(check_peer))
+        .layer(InterceptorLayer::new(move |request| gate.check(request)))
         .add_service(
             service
                 .max_decoding_message_size(limit)

@@ -49,6 +49,8 @@ struct Job {
     /// Tells a job that was submitted again under its number from its former life, whose leases may still be out.
     life: u64,
     phase: Phase,
+    /// No more tiles come to a live job.
+    closed: bool,
     pending: VecDeque<u32>,
     leased: usize,
     deaths: HashMap<u32, u32>,
@@ -74,6 +76,8 @@ pub struct Scheduler {
     /// Jobs that are not queued, builds and others: the lanes.
     builds: BTreeSet<JobNo>,
     shades: BTreeSet<JobNo>,
+    /// Live jobs, which need no lane.
+    lives: BTreeSet<JobNo>,
     /// Who waits for a job.
     awaited: HashMap<JobNo, Vec<JobNo>>,
     leases: BTreeMap<LeaseId, Lease>,
@@ -94,6 +98,8 @@ impl Scheduler {
         let mut effects = Vec::new();
         match event {
             Event::Submit { job, kind, order } => self.submit(job, kind, order, &mut effects),
+            Event::Feed { job, tile } => self.feed(job, tile, &mut effects),
+            Event::Close { job } => self.close(job, &mut effects),
             Event::Prepared { job, tiles } => self.prepared(job, tiles, &mut effects),
             Event::Finished { job, outcome } => self.finished(job, outcome, &mut effects),
             Event::Cancel { job } => self.stop(job, End::Cancelled, &mut effects),
@@ -118,7 +124,7 @@ impl Scheduler {
 
     /// Jobs that wait, and jobs that run.
     pub fn counts(&self) -> (usize, usize) {
-        let running = self.builds.len() + self.shades.len();
+        let running = self.builds.len() + self.shades.len() + self.lives.len();
         (self.jobs.len() - running, running)
     }
 
@@ -130,10 +136,33 @@ impl Scheduler {
     /// Whether a job can rest: it waits, or it is a picture whose tiles are not all there.
     pub fn can_pause(&self, job: JobNo) -> bool {
         self.jobs.get(&job).is_some_and(|job| match job.phase {
-            Phase::Queued | Phase::Shading => true,
+            Phase::Queued | Phase::Shading => job.kind != Kind::Live,
             Phase::Started => job.kind != Kind::Build,
             Phase::Writing | Phase::Stopping(_) => false,
         })
+    }
+
+    fn feed(&mut self, number: JobNo, tile: u32, effects: &mut Vec<Effect>) {
+        let Some(job) = self
+            .jobs
+            .get_mut(&number)
+            .filter(|job| job.kind == Kind::Live && !job.closed)
+        else {
+            return;
+        };
+        if let Some(reason) = &self.workless {
+            let end = End::Failed(reason.clone());
+            return self.end(number, end, effects);
+        }
+        job.pending.push_back(tile);
+        effects.push(Effect::Wake);
+    }
+
+    fn close(&mut self, number: JobNo, effects: &mut Vec<Effect>) {
+        if let Some(job) = self.jobs.get_mut(&number) {
+            job.closed = true;
+            self.settle(number, effects);
+        }
     }
 
     fn submit(&mut self, number: JobNo, kind: Kind, order: Order, effects: &mut Vec<Effect>) {
@@ -158,13 +187,21 @@ impl Scheduler {
             paused: order.paused,
             waits,
             life: self.life_last,
-            phase: Phase::Queued,
+            phase: if kind == Kind::Live {
+                Phase::Shading
+            } else {
+                Phase::Queued
+            },
+            closed: false,
             pending: VecDeque::new(),
             leased: 0,
             deaths: HashMap::new(),
             failures: HashMap::new(),
         };
         self.jobs.insert(number, fresh);
+        if kind == Kind::Live {
+            self.lives.insert(number);
+        }
         self.fill_lanes(effects);
     }
 
@@ -269,6 +306,7 @@ impl Scheduler {
             let Some(job) = self.jobs.remove(&number) else { continue };
             self.builds.remove(&number);
             self.shades.remove(&number);
+            self.lives.remove(&number);
             if !self.jobs.values().any(|other| other.user == job.user) {
                 self.served.remove(&job.user);
             }
@@ -310,7 +348,7 @@ impl Scheduler {
         self.workless = reason.clone();
         let Some(reason) = reason else { return };
         let shading = |number: &JobNo| self.jobs.get(number).is_some_and(|job| job.phase == Phase::Shading);
-        let numbers: Vec<JobNo> = self.shades.iter().copied().filter(shading).collect();
+        let numbers: Vec<JobNo> = self.shades.union(&self.lives).copied().filter(shading).collect();
         for number in numbers {
             self.end(number, End::Failed(reason.clone()), effects);
         }
@@ -358,7 +396,7 @@ impl Scheduler {
     fn next_in_turn(&self) -> Option<JobNo> {
         let lane = || {
             let job = |number: &JobNo| Some((*number, self.jobs.get(number)?));
-            self.shades.iter().filter_map(job)
+            self.shades.union(&self.lives).filter_map(job)
         };
         let mut working: HashMap<UserNo, usize> = HashMap::new();
         for (_, job) in lane() {
@@ -366,6 +404,7 @@ impl Scheduler {
         }
         let takes = |job: &Job| match job.kind {
             Kind::Shade { workers_max } => !job.paused && job.leased < workers_max && !job.pending.is_empty(),
+            Kind::Live => !job.pending.is_empty(),
             Kind::Build => false,
         };
         lane()
@@ -447,6 +486,14 @@ impl Scheduler {
     fn settle(&mut self, number: JobNo, effects: &mut Vec<Effect>) {
         let Some(job) = self.jobs.get_mut(&number) else { return };
         if job.phase != Phase::Shading || job.leased > 0 {
+            return;
+        }
+        if job.kind == Kind::Live {
+            if self.draining {
+                self.end(number, End::Failed(DRAINING.into()), effects);
+            } else if job.closed && job.pending.is_empty() {
+                self.end(number, End::Succeeded, effects);
+            }
             return;
         }
         if job.pending.is_empty() {

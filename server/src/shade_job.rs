@@ -11,11 +11,11 @@ use crate::scheduler::JobNo;
 use pbgi_cache::JobCounters;
 use pbgi_core::limits::IMAGE_PIXELS_MAX;
 use pbgi_core::{Environment, Statistics};
-use pbgi_points::{GBuffer, read_environment};
+use pbgi_points::GBuffer;
 use pbgi_store::StoreError;
 use std::collections::HashSet;
 use std::os::unix::fs::MetadataExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::{OwnedSemaphorePermit, watch};
@@ -158,23 +158,24 @@ fn read(
     stored: Option<String>,
 ) -> Result<(Shading, u64), String> {
     // Said now, not after the work is done.
-    if !task.overwrite && std::fs::symlink_metadata(&task.output).is_ok() {
+    let text = |error: JobError| error.text;
+    let output = dispatcher.roots.write(&task.output, task.overwrite).map_err(text)?;
+    if !task.overwrite && std::fs::symlink_metadata(&output.path).is_ok() {
         let path = task.output.clone();
         return Err(StoreError::Exists { path }.to_string());
     }
-    let mounted = dispatcher
-        .mounts
-        .open(&task.scene)
-        .map_err(|error: JobError| error.text)?;
-    let environment = match &task.environment {
-        Some(path) => {
-            let environment = read_environment(path).map_err(|error| error.to_string())?;
-            Some(Arc::new(crate::environment::shrink(environment)))
-        }
-        None => None,
-    };
-    let fingerprint = fingerprint(&mounted, task);
-    let gbuffer = GBuffer::read(&task.gbuffer).map_err(|error| error.to_string())?;
+    let mounted = dispatcher.open_scene(&task.scene).map_err(text)?;
+    let places = |path: &PathBuf| dispatcher.roots.read(path).map_err(text);
+    let gbuffer_place = places(&task.gbuffer)?;
+    let environment_place = task.environment.as_ref().map(places).transpose()?;
+    let environment = task
+        .environment
+        .as_deref()
+        .map(|path| dispatcher.read_environment(path).map_err(text));
+    let environment = environment.transpose()?;
+    let environment_path = environment_place.as_ref().map(|place| place.path.as_path());
+    let fingerprint = fingerprint(&mounted, &gbuffer_place.path, environment_path);
+    let gbuffer = GBuffer::read(&gbuffer_place.path).map_err(|error| gbuffer_place.hide(&error.to_string()))?;
     let pixels = gbuffer.pixel_count() as u64;
     if pixels > IMAGE_PIXELS_MAX {
         let path = task.gbuffer.display();
@@ -224,17 +225,17 @@ fn take_stored_tiles(dispatcher: &Dispatcher, job: JobNo, shading: &mut Shading)
 }
 
 /// The build of the scene, and length, time and place of the other files.
-fn fingerprint(mounted: &Mounted, task: &ShadeTask) -> String {
-    let file = |path: &PathBuf| {
+fn fingerprint(mounted: &Mounted, gbuffer: &Path, environment: Option<&Path>) -> String {
+    let file = |path: &Path| {
         let known = std::fs::metadata(path).map(|file| {
             let (bytes, seconds, nanos, inode) = (file.len(), file.mtime(), file.mtime_nsec(), file.ino());
             format!("{bytes}-{seconds}.{nanos}-{inode}")
         });
         known.unwrap_or_default()
     };
-    let environment = task.environment.as_ref().map(file).unwrap_or_default();
+    let environment = environment.map(file).unwrap_or_default();
     let build_id = mounted.scene().info().build_id;
-    format!("{build_id} {} {environment}", file(&task.gbuffer))
+    format!("{build_id} {} {environment}", file(gbuffer))
 }
 
 /// Adds up and writes the picture.
@@ -258,6 +259,10 @@ pub async fn write(
         task: task.clone(),
         statistics: statistics.clone(),
         scratch: dispatcher.config.options.scratch_dir.clone(),
+        place: dispatcher
+            .roots
+            .write(&task.output, task.overwrite)
+            .map_err(|error| error.text)?,
     };
     let Shading { frame, memory, .. } = shading;
     let written = tokio::task::spawn_blocking(move || {

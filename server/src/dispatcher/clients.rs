@@ -3,15 +3,16 @@
 use super::durable::{Kept, user_number};
 use super::{Dispatcher, Record, State};
 use crate::error::{JobError, JobErrorKind};
-use crate::job::{JobOptions, JobState, JobStatus, Request, check_job_id, check_path, no_such_job};
+use crate::job::{JobOptions, JobState, JobStatus, Request, check_job_id, no_such_job};
 use crate::limits;
-use crate::mounts::MountStatus;
+use crate::mounts::{MountStatus, Mounted};
+use crate::roots::Want;
 use crate::scheduler::{DRAINING, Event, JobNo, Order};
 use crate::supervisor::WorkerBirth;
 use pbgi_cache::CacheCounters;
-use pbgi_core::{PageKind, SceneInfo, Statistics};
+use pbgi_core::{Environment, NodeRecord, PageKind, PageNo, PointRecord, SceneInfo, Statistics};
 use std::collections::VecDeque;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::watch;
@@ -77,7 +78,7 @@ impl Dispatcher {
     pub async fn submit(self: &Arc<Self>, submission: Submission) -> Result<JobStatus, JobError> {
         check_job_id(&submission.id)?;
         submission.options.validate()?;
-        submission.request.validate()?;
+        submission.request.validate(&self.roots)?;
         let (job, status) = {
             let mut state = self.lock();
             match state.find_same(&submission)? {
@@ -166,7 +167,7 @@ impl Dispatcher {
         Ok((job, state.status(job)?))
     }
 
-    fn enqueue(self: &Arc<Self>, state: &mut State, event: Event) {
+    pub(super) fn enqueue(self: &Arc<Self>, state: &mut State, event: Event) {
         state.active = Instant::now();
         if state.parked > 0 {
             self.supervisor.unpark();
@@ -337,11 +338,81 @@ impl Dispatcher {
     /// # Errors
     /// It is none, or damaged.
     pub async fn scene(self: &Arc<Self>, path: PathBuf) -> Result<SceneInfo, JobError> {
-        check_path("scene", &path)?;
-        let mounts = self.mounts.clone();
-        let opened = tokio::task::spawn_blocking(move || mounts.open(&path)).await;
+        self.roots.check("scene", &path, Want::Read)?;
+        let this = self.clone();
+        let opened = tokio::task::spawn_blocking(move || this.open_scene(&path)).await;
         let opened = opened.map_err(|error| JobError::new(JobErrorKind::Internal, error.to_string()))?;
         opened.map(|mounted| mounted.scene().info().clone())
+    }
+
+    /// Opens and mounts a scene that a client names. Blocks.
+    ///
+    /// # Errors
+    /// It is none, or damaged, or may not be read.
+    pub(crate) fn open_scene(&self, path: &Path) -> Result<Mounted, JobError> {
+        let place = self.roots.read(path)?;
+        self.mounts.open(&place.path).map_err(|error| JobError {
+            text: place.hide(&error.text),
+            ..error
+        })
+    }
+
+    /// Reads an environment map that a client names. Blocks.
+    ///
+    /// # Errors
+    /// It is none, or may not be read.
+    pub(crate) fn read_environment(&self, path: &Path) -> Result<Arc<Environment>, JobError> {
+        let place = self.roots.read(path)?;
+        let environment = pbgi_points::read_environment(&place.path).map_err(|error| {
+            let text = place.hide(&error.to_string());
+            JobError::new(JobErrorKind::Precondition, text)
+        })?;
+        Ok(Arc::new(crate::environment::shrink(environment)))
+    }
+
+    /// Closes a scene; whether it was open. Blocks.
+    ///
+    /// # Errors
+    /// A job uses it.
+    pub(crate) fn drop_scene(&self, path: &Path) -> Result<bool, JobError> {
+        self.roots.check("scene", path, Want::Read)?;
+        let place = self.roots.read(path)?;
+        self.mounts.close(&place.path)
+    }
+
+    /// Reads and verifies every page of a scene; returns how many pages and bytes. Blocks.
+    ///
+    /// # Errors
+    /// It is none, or damaged.
+    pub(crate) fn warm_scene(&self, path: &Path) -> Result<(u64, u64), JobError> {
+        let mounted = self.open_scene(path)?;
+        let (scene, mut pages, mut bytes) = (mounted.scene(), 0, 0);
+        let info = scene.info();
+        let settings = &info.settings;
+        let kinds = [
+            (
+                PageKind::Node,
+                info.node_slots,
+                settings.nodes_per_page,
+                size_of::<NodeRecord>(),
+            ),
+            (
+                PageKind::Point,
+                info.point_count,
+                settings.points_per_page,
+                size_of::<PointRecord>(),
+            ),
+        ];
+        for (kind, records, per_page, record_bytes) in kinds {
+            let mut page = vec![0; per_page as usize * record_bytes];
+            for number in 0..records.div_ceil(u64::from(per_page)) {
+                let read = scene.read_page(kind, PageNo(number as u32), &mut page);
+                read.map_err(|error| crate::mounts::store_error(&error))?;
+                pages += 1;
+                bytes += page.len() as u64;
+            }
+        }
+        Ok((pages, bytes))
     }
 
     /// The daemon.

@@ -55,6 +55,13 @@ impl Dispatcher {
 
     /// Takes a tile into the picture and into the table.
     pub(super) fn accept(&self, state: &mut State, job: JobNo, tile: u32, values: Vec<u8>, counters: &Counters) {
+        if let Some(live) = state.lives.get_mut(&job) {
+            live.tiles.remove(&tile);
+            live.counters.add(counters);
+            // It has room for every tile; a client that left does not listen.
+            let _ = live.results.try_send(Ok((tile, values)));
+            return;
+        }
         let Some(record) = state.jobs.get_mut(&job) else { return };
         if let Some(shading) = &mut record.shading {
             shading.frame.fill(tile, &values);

@@ -1,29 +1,52 @@
-//! Who may connect: so many at once, and only our own user.
+//! So many connections at once, whatever they come over.
 
-use super::status::status;
-use crate::error::{JobError, JobErrorKind};
 use crate::limits;
 use std::io;
+use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::{Duration, Instant};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{UnixListener, UnixStream};
+use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::server::{Connected, UdsConnectInfo};
-use tonic::{Request, Status};
+use tonic::transport::server::Connected;
 
 /// A connection that counts.
 #[derive(Debug)]
-pub(super) struct Connection {
-    stream: UnixStream,
+pub(super) struct Connection<S> {
+    stream: S,
     _place: OwnedSemaphorePermit,
 }
 
+/// Where connections come from.
+pub(super) trait Accept: Send + Sync + 'static {
+    type Stream: Send + 'static;
+
+    fn accept(&self) -> impl Future<Output = io::Result<Self::Stream>> + Send;
+}
+
+impl Accept for UnixListener {
+    type Stream = UnixStream;
+
+    async fn accept(&self) -> io::Result<UnixStream> {
+        UnixListener::accept(self).await.map(|(stream, _)| stream)
+    }
+}
+
+impl Accept for TcpListener {
+    type Stream = TcpStream;
+
+    async fn accept(&self) -> io::Result<TcpStream> {
+        let (stream, _): (TcpStream, SocketAddr) = TcpListener::accept(self).await?;
+        // Answers are small and wanted at once.
+        stream.set_nodelay(true)?;
+        Ok(stream)
+    }
+}
+
 /// Accepts for ever. When there are too many, new ones wait in the socket's own queue.
-pub(super) fn connections(listener: UnixListener) -> ReceiverStream<io::Result<Connection>> {
+pub(super) fn connections<L: Accept>(listener: L) -> ReceiverStream<io::Result<Connection<L::Stream>>> {
     let (sender, receiver) = mpsc::channel(1);
     tokio::spawn(async move {
         let places = Arc::new(Semaphore::new(limits::CONNECTIONS_MAX));
@@ -37,7 +60,7 @@ pub(super) fn connections(listener: UnixListener) -> ReceiverStream<io::Result<C
                 () = sender.closed() => return,
             };
             match accepted {
-                Ok((stream, _)) => {
+                Ok(stream) => {
                     pause = limits::ACCEPT_BACKOFF[0];
                     let connection = Connection { stream, _place: place };
                     if sender.send(Ok(connection)).await.is_err() {
@@ -55,49 +78,21 @@ pub(super) fn connections(listener: UnixListener) -> ReceiverStream<io::Result<C
     ReceiverStream::new(receiver)
 }
 
-/// Lets in our own user only.
-pub(super) fn check_peer(request: Request<()>) -> Result<Request<()>, Status> {
-    let peer = request
-        .extensions()
-        .get::<UdsConnectInfo>()
-        .and_then(|info| info.peer_cred);
-    let own = nix::unistd::geteuid().as_raw();
-    match peer.map(|peer| peer.uid()) {
-        Some(uid) if uid == own => Ok(request),
-        uid => {
-            complain(uid);
-            let text = "only the daemon's own user may call";
-            Err(status(JobError::new(JobErrorKind::Unauthenticated, text)))
-        }
-    }
-}
-
-/// One line a minute, whoever knocks.
-fn complain(uid: Option<u32>) {
-    const INTERVAL: Duration = Duration::from_secs(60);
-    static LAST: Mutex<Option<Instant>> = Mutex::new(None);
-    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
-    if last.is_none_or(|last| last.elapsed() > INTERVAL) {
-        *last = Some(Instant::now());
-        tracing::warn!(?uid, "refused a caller");
-    }
-}
-
-impl Connected for Connection {
-    type ConnectInfo = UdsConnectInfo;
+impl<S: Connected> Connected for Connection<S> {
+    type ConnectInfo = S::ConnectInfo;
 
     fn connect_info(&self) -> Self::ConnectInfo {
         self.stream.connect_info()
     }
 }
 
-impl AsyncRead for Connection {
+impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         Pin::new(&mut self.stream).poll_read(cx, buf)
     }
 }
 
-impl AsyncWrite for Connection {
+impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.stream).poll_write(cx, buf)
     }

@@ -92,7 +92,7 @@ fn build_settings(settings: Option<v1::BuildSettings>) -> BuildSettings {
     }
 }
 
-fn shade_settings(settings: Option<v1::ShadeSettings>) -> ShadeSettings {
+pub(super) fn shade_settings(settings: Option<v1::ShadeSettings>) -> ShadeSettings {
     let (given, default) = (settings.unwrap_or_default(), ShadeSettings::default());
     ShadeSettings {
         max_solid_angle: given.max_solid_angle.unwrap_or(default.max_solid_angle),

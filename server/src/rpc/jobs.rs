@@ -1,6 +1,7 @@
 //! What clients may ask: jobs, scenes, the daemon.
 
 use super::convert;
+use super::gate::Caller;
 use super::status::status;
 use crate::dispatcher::{Dispatcher, Submission};
 use crate::error::{JobError, JobErrorKind};
@@ -13,7 +14,6 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::server::UdsConnectInfo;
 use tonic::{Request, Response, Status};
 
 /// How long a watcher may leave a message unread before it is dropped.
@@ -37,7 +37,7 @@ impl JobService for Jobs {
     type WatchJobStream = ReceiverStream<Result<v1::Job, Status>>;
 
     async fn submit_job(&self, request: Request<v1::SubmitJobRequest>) -> Result<Response<v1::Job>, Status> {
-        let caller = caller(&request);
+        let caller = Caller::of(request.extensions()).name();
         let request = request.into_inner();
         let submission = Submission {
             wire: prost::Message::encode_to_vec(&request),
@@ -108,19 +108,6 @@ impl JobService for Jobs {
     }
 }
 
-/// Who calls, by name: the owner of the process at the other end.
-fn caller<T>(request: &Request<T>) -> String {
-    let peer = request
-        .extensions()
-        .get::<UdsConnectInfo>()
-        .and_then(|info| info.peer_cred);
-    let Some(uid) = peer.map(|peer| peer.uid()) else {
-        return String::new();
-    };
-    let user = nix::unistd::User::from_uid(uid.into()).ok().flatten();
-    user.map_or_else(|| uid.to_string(), |user| user.name)
-}
-
 /// Sends a job's latest state until it ends, or until nobody reads. Returns whether it ended.
 async fn forward(mut job: watch::Receiver<JobStatus>, sender: mpsc::Sender<Result<v1::Job, Status>>) -> bool {
     loop {
@@ -144,6 +131,14 @@ async fn forward(mut job: watch::Receiver<JobStatus>, sender: mpsc::Sender<Resul
     }
 }
 
+/// Keeps work on the disk off the threads that serve.
+async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, JobError> + Send + 'static,
+) -> Result<T, JobError> {
+    let done = tokio::task::spawn_blocking(work).await;
+    done.unwrap_or_else(|error| Err(JobError::new(JobErrorKind::Internal, error.to_string())))
+}
+
 #[tonic::async_trait]
 impl SceneService for Jobs {
     async fn get_scene(&self, request: Request<v1::GetSceneRequest>) -> Result<Response<v1::SceneInfo>, Status> {
@@ -153,6 +148,25 @@ impl SceneService for Jobs {
             .await
             .map_err(status)?;
         Ok(Response::new(convert::scene(&info)))
+    }
+
+    async fn warm_scene(
+        &self,
+        request: Request<v1::WarmSceneRequest>,
+    ) -> Result<Response<v1::WarmSceneResponse>, Status> {
+        let (this, path) = (self.dispatcher.clone(), request.into_inner().scene);
+        let warmed = blocking(move || this.warm_scene(path.as_ref())).await;
+        let (pages, bytes) = warmed.map_err(status)?;
+        Ok(Response::new(v1::WarmSceneResponse { pages, bytes }))
+    }
+
+    async fn drop_scene(
+        &self,
+        request: Request<v1::DropSceneRequest>,
+    ) -> Result<Response<v1::DropSceneResponse>, Status> {
+        let (this, path) = (self.dispatcher.clone(), request.into_inner().scene);
+        let dropped = blocking(move || this.drop_scene(path.as_ref())).await.map_err(status)?;
+        Ok(Response::new(v1::DropSceneResponse { dropped }))
     }
 }
 

@@ -27,6 +27,8 @@ pub enum Kind {
         /// Most workers at once.
         workers_max: usize,
     },
+    /// Workers, for tiles that come with [`Event::Feed`] until [`Event::Close`]. It starts at once, outside the lanes.
+    Live,
 }
 
 /// Number of a user, for fair shares.
@@ -79,6 +81,18 @@ pub enum Event {
         job: JobNo,
         /// Tiles with receivers, in the order of handing out.
         tiles: Vec<u32>,
+    },
+    /// A live job has another tile.
+    Feed {
+        /// The job.
+        job: JobNo,
+        /// The tile; each comes once.
+        tile: u32,
+    },
+    /// A live job has no more tiles.
+    Close {
+        /// The job.
+        job: JobNo,
     },
     /// What [`Effect::Start`] or [`Effect::Write`] began has ended (preparing ends with [`Event::Prepared`] if it went well).
     Finished {

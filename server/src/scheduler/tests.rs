@@ -406,4 +406,22 @@ fn without_workers_pictures_fail_with_the_reason_until_one_asks() {
     assert_eq!(scheduler.on(Event::Prepared { job, tiles }, now), [Effect::Wake]);
 }
 
+#[test]
+fn live_job_takes_tiles_as_they_come_and_ends_when_closed() {
+    let now = Instant::now();
+    let mut scheduler = Scheduler::default();
+    let (job, kind, order) = (JobNo(1), Kind::Live, Order::default());
+    assert_eq!(scheduler.on(Event::Submit { job, kind, order }, now), []);
+    assert_eq!(grant(&mut scheduler, seat(0, 1), now), None);
+    assert_eq!(scheduler.on(Event::Feed { job, tile: 7 }, now), [Effect::Wake]);
+    let (lease, tile) = grant(&mut scheduler, seat(0, 1), now).unwrap();
+    assert_eq!(tile, 7);
+    assert_eq!(scheduler.on(Event::Close { job }, now), []);
+    assert_eq!(scheduler.on(Event::Feed { job, tile: 8 }, now), []);
+    let (seat, failure) = (seat(0, 1), None);
+    let effects = scheduler.on(Event::Complete { seat, lease, failure }, now);
+    let end = End::Succeeded;
+    assert_eq!(effects, [Effect::Accept { job, tile: 7 }, Effect::Ended { job, end }]);
+}
+
 mod simulation;

@@ -180,7 +180,7 @@ fn values(receivers: &[u8]) -> Vec<u8> {
     values
 }
 
-fn write_cloud(path: &Path, count: u32) {
+pub(crate) fn write_cloud(path: &Path, count: u32) {
     let mut writer = PlyWriter::create(path, PlyForm::Floats, &[]).unwrap();
     let sides = Sides {
         front: [1.0; 3],
@@ -200,7 +200,7 @@ fn write_cloud(path: &Path, count: u32) {
 }
 
 /// A picture whose positions are the pixels' places; its last column is a hole.
-fn write_gbuffer(path: &Path, width: u32, height: u32) -> GBuffer {
+pub(crate) fn write_gbuffer(path: &Path, width: u32, height: u32) -> GBuffer {
     let window = Window::of_size(width, height);
     let pixels = window.pixel_count();
     let place = |index: usize| [(index % width as usize) as f32, (index / width as usize) as f32, 7.0];

@@ -6,7 +6,7 @@ use image::ImageDecoder;
 use pbgi_core::Environment;
 use pbgi_core::limits::IMAGE_PIXELS_MAX;
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufReader, Read};
 use std::path::Path;
 
 /// Reads a latitude-longitude picture, `.hdr` (Radiance) or `.exr` (channels R, G, B at the root or in the only layer),
@@ -15,12 +15,15 @@ use std::path::Path;
 /// # Errors
 /// No or a damaged file, another format, no colour channels, too many pixels, or a pixel that is not finite.
 pub fn read_environment(path: &Path) -> Result<Environment, PointsError> {
-    let extension = crate::open::extension(path);
-    let (width, height, mut pixels) = match extension.as_str() {
-        "hdr" | "pic" => read_hdr(path)?,
-        "exr" => read_exr(path)?,
+    let mut magic = [0; 4];
+    let opened = File::open(path).map_err(PointsError::io("open", path))?;
+    // A file that is shorter is neither.
+    let known = opened.take(4).read_exact(&mut magic).map(|()| magic);
+    let (width, height, mut pixels) = match known {
+        Ok([b'#', b'?', ..]) => read_hdr(path)?,
+        Ok([0x76, 0x2f, 0x31, 0x01]) => read_exr(path)?,
         _ => {
-            let what = format!("an environment of kind {extension:?}");
+            let what = "an environment of an unknown kind".to_owned();
             return Err(PointsError::unsupported(path, what, "convert it to .hdr or .exr"));
         }
     };

@@ -1,0 +1,84 @@
+//! Live sessions: opened by a client, fed with tiles, closed.
+
+use super::Dispatcher;
+use crate::error::{JobError, JobErrorKind};
+use crate::framebuffer::TileReceivers;
+use crate::limits;
+use crate::live::{Live, LiveResult, LiveTask};
+use crate::roots::Want;
+use crate::scheduler::{DRAINING, Event, JobNo, Kind, Order};
+use crate::shade_job::Counters;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+use tokio::sync::mpsc;
+
+impl Dispatcher {
+    /// Opens a session. Its values come through the receiver, in whatever order they are done.
+    ///
+    /// # Errors
+    /// A scene or an environment that cannot be used, settings out of range, too many sessions.
+    pub async fn open_live(self: &Arc<Self>, task: LiveTask) -> Result<(JobNo, mpsc::Receiver<LiveResult>), JobError> {
+        task.settings
+            .validate()
+            .map_err(|error| JobError::invalid(error.to_string()))?;
+        self.roots.check("scene", &task.scene, Want::Read)?;
+        if let Some(path) = &task.environment {
+            self.roots.check("environment", path, Want::Read)?;
+        }
+        let (this, paths) = (self.clone(), task.clone());
+        let opened = tokio::task::spawn_blocking(move || {
+            let mounted = this.open_scene(&paths.scene)?;
+            let environment = paths.environment.map(|path| this.read_environment(&path)).transpose()?;
+            Ok::<_, JobError>((mounted, environment))
+        });
+        let opened = opened
+            .await
+            .map_err(|error| JobError::new(JobErrorKind::Internal, error.to_string()))?;
+        let (mounted, environment) = opened?;
+        let (results, values) = mpsc::channel(limits::LIVE_TILES_MAX + 1);
+        let mut state = self.lock();
+        if state.draining {
+            return Err(JobError::new(JobErrorKind::Unavailable, DRAINING));
+        }
+        if state.lives.len() >= limits::LIVE_SESSIONS_MAX {
+            let text = format!("{} clients are streaming already", limits::LIVE_SESSIONS_MAX);
+            return Err(JobError::new(JobErrorKind::Exhausted, text));
+        }
+        state.number_last += 1;
+        let (job, kind) = (JobNo(state.number_last), Kind::Live);
+        let live = Live {
+            mounted,
+            settings: task.settings,
+            environment,
+            tiles: BTreeMap::new(),
+            counters: Counters::default(),
+            results,
+        };
+        state.lives.insert(job, live);
+        let order = Order {
+            // Somebody sits and waits.
+            priority: limits::PRIORITY_MAX,
+            user: super::durable::user_number(&task.user),
+            ..Order::default()
+        };
+        self.enqueue(&mut state, Event::Submit { job, kind, order });
+        Ok((job, values))
+    }
+
+    /// Hands a session's tile out. The caller keeps to [`limits::LIVE_TILES_MAX`].
+    pub fn feed(self: &Arc<Self>, job: JobNo, tile: u32, receivers: TileReceivers) {
+        let mut state = self.lock();
+        if let Some(live) = state.lives.get_mut(&job) {
+            live.tiles.insert(tile, receivers);
+            self.dispatch(&mut state, Event::Feed { job, tile }, None);
+        }
+    }
+
+    /// Ends a session: what is not done is let go.
+    pub fn close_live(self: &Arc<Self>, job: JobNo) {
+        let mut state = self.lock();
+        state.active = Instant::now();
+        self.dispatch(&mut state, Event::Cancel { job }, None);
+    }
+}
