@@ -17,6 +17,14 @@ pub(crate) fn build_task(job: &BuildJob) -> Result<v1::BuildTask, String> {
         density: job.density.map(|density| match density {
             Density::Spacing(spacing) => v1::build_task::Density::Spacing(spacing),
             Density::Points(points) => v1::build_task::Density::Points(points),
+            Density::View(view) => v1::build_task::Density::View(v1::ViewDensity {
+                camera: view.camera as u32,
+                width: view.size[0],
+                height: view.size[1],
+                pixels: view.pixels,
+                floor: view.floor,
+                ceiling: view.ceiling,
+            }),
         }),
         cloud: Some(wire_cloud(&job.cloud)),
     })

@@ -125,6 +125,7 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
             Density::Default => default.density,
             Density::Spacing(spacing) => pbgi_points::Density::Spacing(spacing),
             Density::Points(points) => pbgi_points::Density::Points(points),
+            Density::View(view) => pbgi_points::Density::View(view),
         },
         cloud: spec.cloud,
         // What the build itself cannot do without comes first.

@@ -5,7 +5,7 @@ use crate::limits;
 use crate::roots::{Roots, Want};
 use crate::scheduler::{JobNo, Kind};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
-use pbgi_points::CloudOptions;
+use pbgi_points::{CloudOptions, ViewDensity};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
@@ -20,6 +20,8 @@ pub enum Density {
     Spacing(f32),
     /// Number of points.
     Points(u64),
+    /// As a camera sees them.
+    View(ViewDensity),
 }
 
 /// Points or meshes in, a scene out.

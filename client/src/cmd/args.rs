@@ -7,7 +7,7 @@ use pbgi_client::JobOptions;
 use pbgi_client::private::PrivateOptions;
 use pbgi_client::size::parse_bytes;
 use pbgi_core::{BuildSettings, ShadeSettings, limits};
-use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius};
+use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, ViewDensity};
 use std::path::PathBuf;
 
 /// Which daemon.
@@ -77,7 +77,7 @@ impl StatsArgs {
 }
 
 /// How densely meshes are sampled.
-#[derive(Args, Clone, Copy, Debug, Default)]
+#[derive(Args, Clone, Copy, Debug)]
 #[command(next_help_heading = "Sampling of meshes")]
 pub(crate) struct DensityArgs {
     /// Number of points on all surfaces together
@@ -86,12 +86,38 @@ pub(crate) struct DensityArgs {
     /// Distance between neighbouring points, world units
     #[arg(long, allow_negative_numbers = true, value_name = "D", value_parser = positive)]
     pub(crate) spacing: Option<f32>,
+    /// Distance between neighbouring points as a camera sees them, pixels: finer near, coarser far and out of its sight
+    #[arg(long, allow_negative_numbers = true, value_name = "PIXELS", value_parser = positive, conflicts_with_all = ["points", "spacing"])]
+    view_spacing: Option<f32>,
+    /// Which of the scene's cameras that is, from 0
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "view_spacing")]
+    view_camera: usize,
+    /// Pixels of its picture
+    #[arg(long, value_name = "WxH", default_value = "1920x1080", value_parser = picture_size, requires = "view_spacing")]
+    view_size: Size,
+    /// Least distance between points, world units [default: a 20,000th of the scene's diagonal]
+    #[arg(long, allow_negative_numbers = true, value_name = "D", value_parser = positive, requires = "view_spacing")]
+    spacing_min: Option<f32>,
+    /// Greatest distance between points, world units [default: a 200th of the scene's diagonal]
+    #[arg(long, allow_negative_numbers = true, value_name = "D", value_parser = positive, requires = "view_spacing")]
+    spacing_max: Option<f32>,
 }
 
 impl DensityArgs {
     pub(crate) fn density(&self) -> Option<Density> {
+        let view = |pixels| {
+            Density::View(ViewDensity {
+                camera: self.view_camera,
+                size: [self.view_size.width, self.view_size.height],
+                pixels,
+                floor: self.spacing_min,
+                ceiling: self.spacing_max,
+            })
+        };
         let points = self.points.map(Density::Points);
-        points.or(self.spacing.map(Density::Spacing))
+        points
+            .or(self.spacing.map(Density::Spacing))
+            .or(self.view_spacing.map(view))
     }
 }
 

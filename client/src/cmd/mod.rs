@@ -6,6 +6,7 @@ mod daemon;
 mod failure;
 mod files;
 mod frame;
+mod generate;
 mod interrupt;
 mod jobs;
 mod mesh;
@@ -50,6 +51,8 @@ enum Command {
     Render(render::RenderArgs),
     /// Turn a mesh and its lights into lit points
     Sample(mesh::SampleArgs),
+    /// Make a procedural scene of any size: a tree, a head of hair, a city, a forest
+    Generate(generate::GenerateArgs),
     /// Render what a camera sees of a mesh: positions, normals, albedo, direct light
     Gbuffer(mesh::GbufferArgs),
     /// Build the octree of a scene from meshes or point clouds
@@ -110,6 +113,7 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
         Command::Demo(args) => render::demo(args, interrupt).await,
         Command::Render(args) => render::render(args, interrupt).await,
         Command::Sample(args) => mesh::sample(args, interrupt).await,
+        Command::Generate(args) => generate::generate(args, interrupt).await,
         Command::Gbuffer(args) => mesh::gbuffer(args, interrupt).await,
         Command::Build(args) => jobs::build(args, interrupt).await,
         Command::Shade(args) => jobs::shade(args, interrupt).await,
@@ -139,8 +143,8 @@ mod tests {
     fn every_command_of_the_contract_is_there() {
         let command = Arguments::command();
         for name in [
-            "demo", "render", "sample", "gbuffer", "build", "shade", "info", "status", "jobs", "watch", "cancel",
-            "pause", "resume", "retry", "shutdown",
+            "demo", "render", "sample", "generate", "gbuffer", "build", "shade", "info", "status", "jobs", "watch",
+            "cancel", "pause", "resume", "retry", "shutdown",
         ] {
             assert!(command.find_subcommand(name).is_some(), "{name}");
         }

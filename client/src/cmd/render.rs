@@ -186,6 +186,7 @@ async fn scene(
         match plan.density {
             Density::Points(points) => progress.say(&format!("sampling about {} points", summary::grouped(points))),
             Density::Spacing(spacing) => progress.say(&format!("sampling points {spacing} apart")),
+            Density::View(view) => progress.say(&format!("sampling points {} pixels apart", view.pixels)),
         }
         statistics = session::run(client, &Work::Build(job), interrupt, progress).await?;
     }

@@ -3,7 +3,8 @@
 //! [`open_input`] turns files into one stream of lit points: meshes ([`MeshScene`]: glTF, OBJ) are sampled evenly and lit by
 //! their lights with shadow rays, clouds ([`cloud`]: PLY, LAS, LAZ, COPC, PTC, built scenes) are read as they are, with
 //! normals and radii estimated where they have none. [`GBuffer`] says what a camera sees, rendered from a
-//! mesh or read from another renderer's EXR passes. [`image`] writes the pictures. [`demo`] makes a scene on the spot.
+//! mesh or read from another renderer's EXR passes. [`image`] writes the pictures. [`demo`] makes a scene on the spot, [`procedural`] one of any
+//! size.
 //!
 //! World space is the file's, y up; radiance is linear, W/(m2 sr). Nothing here keeps all points in memory. This crate does
 //! not build octrees and does not gather light.
@@ -18,10 +19,12 @@ pub mod image;
 pub mod light;
 pub mod limits;
 pub mod ply;
+pub mod procedural;
 pub mod scene;
 
 mod charts;
 mod estimate;
+mod glb;
 mod gltf_file;
 mod material;
 mod named_file;
@@ -38,7 +41,8 @@ pub use cloud::{CloudOptions, Facing, InvalidPoints, Radius};
 pub use error::PointsError;
 pub use gbuffer::{GBuffer, GBufferChannels};
 pub use light::{Light, LightKind};
-pub use open::{Density, Input, InputOptions, SampleOptions, open_input, origin_of};
+pub use open::{Density, Input, InputOptions, SampleOptions, ViewDensity, open_input, origin_of};
 pub use ply::{PlyForm, write_point_ply};
+pub use procedural::{Kind, ProceduralScene};
 pub use sample::MeshPoints;
 pub use scene::MeshScene;

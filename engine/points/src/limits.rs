@@ -61,6 +61,9 @@ pub const TRIANGLE_BYTES: usize = 400;
 /// Memory of a placed mesh, its share of the BVH over all of them included.
 pub const INSTANCE_BYTES: usize = 500;
 
+/// Most patches of a procedural scene that are written as triangles: a gigabyte.
+pub const GLB_PATCHES_MAX: u64 = 1 << 23;
+
 /// Most placed meshes in a scene.
 pub const INSTANCES_MAX: usize = 1 << 22;
 

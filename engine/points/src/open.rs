@@ -23,6 +23,24 @@ pub enum Density {
     Spacing(f32),
     /// About this many points on all surfaces of all mesh files together, before masked texels are cut out.
     Points(u64),
+    /// As finely as a camera sees them.
+    View(ViewDensity),
+}
+
+/// Points of the size of pixels: near ones are close together, far ones and those that the camera does not see are not.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ViewDensity {
+    /// Number of the scene's camera.
+    pub camera: usize,
+    /// Width and height of its picture, pixels.
+    pub size: [u32; 2],
+    /// Distance between neighbouring points, pixels.
+    pub pixels: f32,
+    /// Least distance, world units; `None` for a 20,000th of the scene's diagonal.
+    pub floor: Option<f32>,
+    /// Greatest distance, world units; `None` for a 200th of the diagonal.
+    pub ceiling: Option<f32>,
 }
 
 /// How meshes become points.

@@ -179,6 +179,14 @@ impl MeshScene {
         self.instances.iter().map(count).sum()
     }
 
+    /// Corners of all triangles in the world, placed ones each time.
+    pub(crate) fn placed_triangles(&self) -> impl Iterator<Item = [DVec3; 3]> + '_ {
+        self.instances.iter().flat_map(|instance| {
+            let geometry = &self.geometries[instance.geometry];
+            (0..geometry.triangles.len()).map(|triangle| instance.corners(geometry, triangle))
+        })
+    }
+
     /// The punctual lights.
     pub fn lights(&self) -> &[Light] {
         &self.lights

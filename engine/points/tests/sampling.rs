@@ -7,7 +7,7 @@ mod common;
 use common::{GltfScene, assert_says, collect, png_uri, sample, shared};
 use glam::Vec3;
 use pbgi_core::{PointRecord, PointStream};
-use pbgi_points::{Density, InputOptions, MeshPoints, MeshScene, SampleOptions, open_input};
+use pbgi_points::{Density, InputOptions, MeshPoints, MeshScene, SampleOptions, ViewDensity, open_input};
 use serde_json::json;
 use std::collections::HashMap;
 use std::f32::consts::PI;
@@ -367,4 +367,71 @@ fn sponza_gives_two_hundred_thousand_lit_points_with_its_masks_cut_out() {
     let whole = sample(MeshScene::load(&opaque).unwrap(), Density::Points(200_000));
     println!("{} points, {} without masks, {lit} lit", points.len(), whole.len());
     assert!(whole.len() - points.len() > 400);
+}
+
+#[test]
+fn points_are_as_large_as_the_camera_sees_them_between_floor_and_ceiling() {
+    // A ground of 200 by 200 seen along it from above its middle.
+    let mut scene = GltfScene::new();
+    let ground = [
+        -100.0, 0.0, -100.0, -100.0, 0.0, 100.0, 100.0, 0.0, 100.0, 100.0, 0.0, -100.0,
+    ];
+    let positions = scene.floats(&ground, "VEC3");
+    let indices: Vec<u8> = [0u16, 1, 2, 0, 2, 3]
+        .iter()
+        .flat_map(|index| index.to_le_bytes())
+        .collect();
+    let indices = scene.accessor(&indices, 6, 5123, "SCALAR");
+    let mesh = scene.push(
+        "meshes",
+        json!({ "primitives": [{ "attributes": { "POSITION": positions }, "indices": indices }] }),
+    );
+    let camera = scene.push(
+        "cameras",
+        json!({ "type": "perspective", "perspective": { "yfov": 0.9, "znear": 0.1 } }),
+    );
+    scene.node(json!({ "mesh": mesh }));
+    scene.node(json!({ "camera": camera, "translation": [0.0, 2.0, 0.0] }));
+    let folder = tempfile::tempdir().unwrap();
+    let scene = MeshScene::load(&scene.write(folder.path())).unwrap();
+    let (floor, ceiling) = (0.1, 2.0);
+    let density = Density::View(ViewDensity {
+        camera: 0,
+        size: [400, 300],
+        pixels: 2.0,
+        floor: Some(floor),
+        ceiling: Some(ceiling),
+    });
+    let options = SampleOptions {
+        density,
+        ..SampleOptions::default()
+    };
+    let mut stream = MeshPoints::new(scene, &options).unwrap();
+    let points = collect(&mut stream);
+    stream.rewind().unwrap();
+    assert!(points == collect(&mut stream));
+    let area: f64 = points.iter().map(|point| f64::from(point.area())).sum();
+    assert!((area / 40_000.0 - 1.0).abs() < 0.03, "{area}");
+    let pixel = 2.0 * (0.45f32).tan() / 300.0;
+    let (mut seen, mut behind) = (0, 0);
+    for point in &points {
+        let [x, _, z] = point.position;
+        let (distance, spacing) = ((x * x + z * z + 4.0).sqrt(), point.area().sqrt());
+        assert!((floor * 0.99..ceiling * 1.2).contains(&spacing), "{spacing}");
+        let wanted = (2.0 * pixel * distance).clamp(floor, ceiling);
+        if z < -x.abs() - 10.0 {
+            seen += 1;
+            assert!(
+                (0.6..1.5).contains(&(spacing / wanted)),
+                "{spacing} at {distance}, {wanted} wanted"
+            );
+        } else if z > 20.0 {
+            behind += 1;
+            assert!(
+                spacing > 1.5 * wanted,
+                "{spacing} at {distance} behind, {wanted} in front"
+            );
+        }
+    }
+    assert!(seen > 4 * behind, "{seen} in front, {behind} behind");
 }

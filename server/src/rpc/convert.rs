@@ -5,7 +5,7 @@ use crate::error::JobError;
 use crate::job::{BuildTask, Density, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
 use crate::shade_job::Counters;
 use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Facing, InvalidPoints, Radius};
+use pbgi_points::{CloudOptions, Facing, InvalidPoints, Radius, ViewDensity};
 use pbgi_proto::v1;
 
 pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Request, JobError> {
@@ -19,6 +19,13 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
                 None => Density::Default,
                 Some(v1::build_task::Density::Spacing(spacing)) => Density::Spacing(spacing),
                 Some(v1::build_task::Density::Points(points)) => Density::Points(points),
+                Some(v1::build_task::Density::View(view)) => Density::View(ViewDensity {
+                    camera: view.camera as usize,
+                    size: [view.width, view.height],
+                    pixels: view.pixels,
+                    floor: view.floor,
+                    ceiling: view.ceiling,
+                }),
             },
             cloud: cloud(task.cloud.unwrap_or_default())?,
         })),

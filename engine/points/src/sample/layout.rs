@@ -1,6 +1,7 @@
 //! Where points lie on a surface: on a hexagonal lattice in the plane of each chart, or, on charts too small for one,
 //! wherever the area summed along them passes the next whole point.
 
+use super::density::{Fit, Sizes};
 use crate::scene::{Instance, MeshScene, SurfaceId, area_vector};
 use glam::{DAffine2, DMat2, DVec2, DVec3, Vec3};
 use std::f64::consts::{PI, TAU};
@@ -25,8 +26,7 @@ pub(crate) struct Surfel {
 /// Walks over all surfaces of a scene and lays out points, always the same ones.
 #[derive(Clone)]
 pub(crate) struct Layout {
-    /// Area of a point, square world units.
-    area: f64,
+    sizes: Sizes,
     instance: usize,
     chart: usize,
     /// Next triangle of the chart.
@@ -34,8 +34,10 @@ pub(crate) struct Layout {
     plane: Option<Plane>,
     /// The triangle whose lattice points are being handed out.
     rows: Option<Rows>,
-    /// The triangle that is being sampled along its area.
-    along: Option<Face>,
+    /// The triangle that is being sampled along its area, and the area of its points.
+    along: Option<(Face, f64)>,
+    /// Parts of the triangle whose turn is to come.
+    pieces: Vec<Face>,
     /// Area since the last point that was not on a lattice, in points.
     owed: f64,
     /// Points not on a lattice so far: index into the sequence that places them.
@@ -49,14 +51,18 @@ struct Plane {
     normal: DVec3,
     axes: [DVec3; 2],
     lattice_from_plane: DAffine2,
+    /// Of a point of this lattice.
+    area: f64,
 }
 
-/// A placed triangle.
+/// A placed triangle, or a part of one.
 #[derive(Clone, Copy)]
-struct Face {
-    corners: [DVec3; 3],
+pub(super) struct Face {
+    pub(super) corners: [DVec3; 3],
     normal: DVec3,
-    area: f64,
+    pub(super) area: f64,
+    /// Of its corners, in the whole triangle.
+    barycentric: [DVec2; 3],
     instance: u32,
     triangle: u32,
 }
@@ -75,16 +81,16 @@ struct Rows {
 }
 
 impl Layout {
-    /// Points of `area` square units each.
-    pub(crate) fn new(area: f64) -> Self {
+    pub(crate) fn new(sizes: Sizes) -> Self {
         Self {
-            area,
+            sizes,
             instance: 0,
             chart: 0,
             triangle: 0,
             plane: None,
             rows: None,
             along: None,
+            pieces: Vec::new(),
             owed: 0.5,
             sequence: 0,
         }
@@ -98,11 +104,13 @@ impl Layout {
                     Some(surfel) => surfels.push(surfel),
                     None => self.rows = None,
                 }
-            } else if let Some(face) = self.along {
-                match self.next_along(&face) {
+            } else if let Some((face, area)) = self.along {
+                match self.next_along(&face, area) {
                     Some(surfel) => surfels.push(surfel),
                     None => self.along = None,
                 }
+            } else if let Some(piece) = self.pieces.pop() {
+                self.place(piece);
             } else if !self.step(scene) {
                 return !surfels.is_empty();
             }
@@ -132,25 +140,33 @@ impl Layout {
         };
         self.triangle += 1;
         let face = Face::new(scene, self.instance, triangle);
-        if face.area <= 0.0 {
-            return true;
-        }
-        match self.plane {
-            Some(plane) if plane.normal.dot(face.normal) >= LEAN_COS_MIN => {
-                self.rows = Rows::new(face, &plane, self.area);
-            }
-            _ => {
-                self.owed += face.area / self.area;
-                self.along = Some(face);
-            }
+        if face.area > 0.0 {
+            self.pieces.push(face);
         }
         true
+    }
+
+    /// Begins with the points of a face, or cuts it in two where they differ in size.
+    fn place(&mut self, face: Face) {
+        let area = match self.sizes.fit(&face) {
+            Fit::Alike(area) => area,
+            Fit::Cut => return self.pieces.extend(face.halves()),
+        };
+        match self.plane {
+            Some(plane) if plane.normal.dot(face.normal) >= LEAN_COS_MIN => {
+                self.rows = Rows::new(face, &plane, area);
+            }
+            _ => {
+                self.owed += face.area / area;
+                self.along = Some((face, area));
+            }
+        }
     }
 
     /// The lattice of a chart that is large enough for one.
     fn plane_of(&self, scene: &MeshScene, instance: &Instance, triangles: &[u32]) -> Option<Plane> {
         let geometry = &scene.geometries[instance.geometry];
-        let points = |triangle: &u32| area_vector(&instance.corners(geometry, *triangle as usize)).length() / self.area;
+        let points = |triangle: &u32| self.sizes.points_on(&instance.corners(geometry, *triangle as usize));
         if triangles.iter().map(points).sum::<f64>() < LATTICE_POINTS_MIN {
             return None;
         }
@@ -159,7 +175,8 @@ impl Layout {
             let seed = (self.instance as u64) << 32 ^ self.chart as u64;
             hash(seed ^ hash(salt)) as f64 / 2f64.powi(64)
         };
-        let edge = (self.area * 2.0 / 3f64.sqrt()).sqrt();
+        let area = self.sizes.smallest();
+        let edge = (area * 2.0 / 3f64.sqrt()).sqrt();
         let plane_from_lattice = DMat2::from_angle(noise(1) * TAU)
             * DMat2::from_cols(DVec2::new(edge, 0.0), DVec2::new(edge / 2.0, edge * 3f64.sqrt() / 2.0));
         let lattice_from_plane = DAffine2 {
@@ -172,10 +189,11 @@ impl Layout {
             normal: seed.normal,
             axes: [u, v],
             lattice_from_plane,
+            area,
         })
     }
 
-    fn next_along(&mut self, face: &Face) -> Option<Surfel> {
+    fn next_along(&mut self, face: &Face, area: f64) -> Option<Surfel> {
         if self.owed < 1.0 {
             return None;
         }
@@ -184,7 +202,7 @@ impl Layout {
         self.sequence += 1;
         // The far half of the parallelogram is folded onto the triangle.
         let (v, w) = if v + w > 1.0 { (1.0 - v, 1.0 - w) } else { (v, w) };
-        Some(face.surfel(v, w, radius_of(self.area)))
+        Some(face.surfel(v, w, radius_of(area)))
     }
 }
 
@@ -198,14 +216,33 @@ impl Face {
             corners,
             normal: front.normalize_or_zero(),
             area: vector.length(),
+            barycentric: [DVec2::ZERO, DVec2::X, DVec2::Y],
             instance: index as u32,
             triangle,
         }
     }
 
+    /// Both sides of a cut from the middle of the longest edge.
+    fn halves(&self) -> [Self; 2] {
+        let length = |edge: usize| self.corners[edge].distance_squared(self.corners[(edge + 1) % 3]);
+        let edge = (0..3).max_by(|&a, &b| length(a).total_cmp(&length(b))).unwrap_or(0);
+        let (a, b) = (edge, (edge + 1) % 3);
+        let middle = (self.corners[a] + self.corners[b]) / 2.0;
+        let weight = (self.barycentric[a] + self.barycentric[b]) / 2.0;
+        [a, b].map(|corner| {
+            let mut half = *self;
+            half.corners[corner] = middle;
+            half.barycentric[corner] = weight;
+            half.area = self.area / 2.0;
+            half
+        })
+    }
+
     fn surfel(&self, v: f64, w: f64, radius: f32) -> Surfel {
         let [a, b, c] = self.corners;
         let position = a * (1.0 - v - w) + b * v + c * w;
+        let [p, q, r] = self.barycentric;
+        let barycentric = p * (1.0 - v - w) + q * v + r * w;
         Surfel {
             position: position.as_vec3(),
             normal: self.normal.as_vec3(),
@@ -213,7 +250,7 @@ impl Face {
             surface: SurfaceId {
                 instance: self.instance,
                 triangle: self.triangle,
-                barycentric: [v as f32, w as f32],
+                barycentric: barycentric.as_vec2().to_array(),
             },
         }
     }
@@ -228,9 +265,10 @@ impl Plane {
 }
 
 impl Rows {
-    /// `None` where no row crosses the triangle.
+    /// `None` where no row crosses the triangle. Larger points lie on the same lattice, stretched.
     fn new(face: Face, plane: &Plane, area: f64) -> Option<Self> {
-        let corners = face.corners.map(|corner| plane.lattice(corner));
+        let stretch = (plane.area / area).sqrt();
+        let corners = face.corners.map(|corner| plane.lattice(corner) * stretch);
         let low = corners.iter().map(|corner| corner.y).fold(f64::INFINITY, f64::min);
         let high = corners.iter().map(|corner| corner.y).fold(f64::NEG_INFINITY, f64::max);
         // Rows from the first at or above the lowest corner to the last below the highest.

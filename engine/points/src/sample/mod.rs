@@ -1,11 +1,13 @@
 //! Meshes as streams of lit points: laid out evenly ([`layout`]), lit batch by batch, never all in memory.
 
+mod density;
 mod layout;
 
 use crate::error::PointsError;
 use crate::limits;
 use crate::open::{Density, SampleOptions};
 use crate::scene::MeshScene;
+use density::{Sizes, View};
 use glam::Vec3;
 use layout::{Layout, Surfel};
 use pbgi_core::point::Sides;
@@ -15,13 +17,15 @@ use std::sync::{Mutex, PoisonError};
 
 /// The points of a mesh scene.
 ///
-/// Each stands for the same area (on curved surfaces up to 5 % more) and carries, for either side, the radiance
+/// Each stands for the same area (on curved surfaces up to 5 % more), or for one that a camera asks for, and carries, for either side, the radiance
 /// `albedo E / pi + emission` that leaves it: E from the punctual lights, shadowed; emission on the front, and on the back of
 /// double-sided materials. Both sides of every surface receive and block light, whatever the material says. Normals are
 /// geometric. Where a texture cuts the surface out there are no points.
 pub struct MeshPoints {
     scene: MeshScene,
-    area: f64,
+    sizes: Sizes,
+    /// About how many there are.
+    points: f64,
     threads: usize,
     layout: Layout,
     surfels: Vec<Surfel>,
@@ -34,7 +38,7 @@ impl MeshPoints {
     /// A spacing or a number of points out of range.
     pub fn new(scene: MeshScene, options: &SampleOptions) -> Result<Self, PointsError> {
         let total = scene.area();
-        let (area, points) = match options.density {
+        let (sizes, points) = match options.density {
             Density::Spacing(spacing) => {
                 if !(spacing > 0.0 && spacing.is_finite()) {
                     return Err(PointsError::Request(format!(
@@ -42,10 +46,20 @@ impl MeshPoints {
                     )));
                 }
                 let area = f64::from(spacing) * f64::from(spacing);
-                (area, total / area)
+                (Sizes::Even(area), total / area)
             }
-            Density::Points(points) => (total / points as f64, points as f64),
+            Density::Points(points) => (Sizes::Even(total / points as f64), points as f64),
+            Density::View(density) => {
+                let camera = scene.camera(density.camera)?;
+                let diagonal = f64::from(scene.bounds().diagonal());
+                let sizes = Sizes::View(View::new(&density, &camera, diagonal)?);
+                (
+                    sizes,
+                    scene.placed_triangles().map(|corners| sizes.points_on(&corners)).sum(),
+                )
+            }
         };
+        let area = sizes.smallest();
         if !(points <= limits::POINTS_MAX as f64 && area.is_finite() && area > 0.0) {
             let most = limits::POINTS_MAX;
             return Err(PointsError::Request(format!(
@@ -54,9 +68,10 @@ impl MeshPoints {
         }
         Ok(Self {
             scene,
-            area,
+            sizes,
+            points,
             threads: options.threads.max(1),
-            layout: Layout::new(area),
+            layout: Layout::new(sizes),
             surfels: Vec::new(),
         })
     }
@@ -66,9 +81,9 @@ impl MeshPoints {
         &self.scene
     }
 
-    /// Distance between neighbouring points, world units: the root of their area.
+    /// Distance between neighbouring points where they are densest, world units: the root of their area.
     pub fn spacing(&self) -> f64 {
-        self.area.sqrt()
+        self.sizes.smallest().sqrt()
     }
 
     fn light(&self, surfel: &Surfel) -> Result<Option<PointRecord>, InvalidPoint> {
@@ -131,7 +146,7 @@ impl PointStream for MeshPoints {
     }
 
     fn len_hint(&self) -> Option<u64> {
-        Some((self.scene.area() / self.area).round() as u64)
+        Some(self.points.round() as u64)
     }
 
     fn next_batch(&mut self, batch: &mut Vec<PointRecord>) -> Result<bool, PointsError> {
@@ -148,7 +163,7 @@ impl PointStream for MeshPoints {
     }
 
     fn rewind(&mut self) -> Result<(), PointsError> {
-        self.layout = Layout::new(self.area);
+        self.layout = Layout::new(self.sizes);
         Ok(())
     }
 }
