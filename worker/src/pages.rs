@@ -63,8 +63,8 @@ pub struct SceneView {
     mount: MountId,
     nodes: FileView,
     points: FileView,
-    /// Number of the receiver that is being shaded.
-    receiver: u32,
+    /// Number of the pack of receivers that is being shaded.
+    pack: u32,
 }
 
 /// One of the scene's files.
@@ -74,7 +74,7 @@ struct FileView {
     records: u64,
     records_per_page: u32,
     page_bytes: u64,
-    /// The receiver that touched a page last, by page.
+    /// By page, who touched it last: the pack, and its receivers in the low bits.
     stamps: Vec<u32>,
 }
 
@@ -92,19 +92,36 @@ impl SceneView {
             mount,
             nodes: file(PageKind::Node, scene.node_slots, scene.settings.nodes_per_page),
             points: file(PageKind::Point, scene.point_count, scene.settings.points_per_page),
-            receiver: 0,
+            pack: 0,
         }
     }
 
-    fn begin_receiver(&mut self) {
-        match self.receiver.checked_add(1) {
-            Some(next) => self.receiver = next,
-            None => {
-                self.nodes.stamps.fill(0);
-                self.points.stamps.fill(0);
-                self.receiver = 1;
-            }
+    fn begin_pack(&mut self) {
+        if self.pack == PACK_MAX {
+            self.nodes.stamps.fill(0);
+            self.points.stamps.fill(0);
+            self.pack = 0;
         }
+        self.pack += 1;
+    }
+}
+
+/// Bits of a stamp that name receivers.
+const RECEIVER_BITS: u32 = 8;
+/// Packs that can be told apart by stamps.
+const PACK_MAX: u32 = u32::MAX >> RECEIVER_BITS;
+
+impl FileView {
+    /// Notes that receivers of a pack touch a page; says how many of them do for the first time.
+    fn touch(&mut self, page: u32, pack: u32, receivers: u8) -> Option<u32> {
+        let stamp = self.stamps.get_mut(page as usize)?;
+        let before = if *stamp >> RECEIVER_BITS == pack {
+            *stamp as u8
+        } else {
+            0
+        };
+        *stamp = pack << RECEIVER_BITS | u32::from(before | receivers);
+        Some((receivers & !before).count_ones())
     }
 }
 
@@ -116,6 +133,8 @@ struct Place {
     first: u32,
     /// Records of the file in this page.
     count: u32,
+    /// Receivers of the pack that are known to touch it.
+    receivers: u8,
 }
 
 /// Serves the shading code for one tile.
@@ -164,17 +183,19 @@ impl<'a> PageSource<'a> {
 
     /// The place of a record, its page pinned.
     #[inline]
-    fn place(&mut self, kind: PageKind, index: u32) -> Result<Place, SourceError> {
-        self.accesses += 1;
+    fn place(&mut self, kind: PageKind, index: u32, receivers: u8) -> Result<Place, SourceError> {
+        self.accesses += u64::from(receivers.count_ones());
         match self.places[kind as usize] {
             // Still pinned: it is the page of this kind that was used last.
-            Some(place) if index.wrapping_sub(place.first) < place.count => Ok(place),
-            _ => self.turn_to(kind, index),
+            Some(place) if index.wrapping_sub(place.first) < place.count && receivers & !place.receivers == 0 => {
+                Ok(place)
+            }
+            _ => self.turn_to(kind, index, receivers),
         }
     }
 
-    fn turn_to(&mut self, kind: PageKind, index: u32) -> Result<Place, SourceError> {
-        let receiver = self.scene.receiver;
+    fn turn_to(&mut self, kind: PageKind, index: u32, receivers: u8) -> Result<Place, SourceError> {
+        let pack = self.scene.pack;
         let mount = self.scene.mount;
         let file = match kind {
             PageKind::Node => &mut self.scene.nodes,
@@ -186,21 +207,25 @@ impl<'a> PageSource<'a> {
             kind,
             page: PageNo(page),
         };
-        let stamp = file.stamps.get_mut(page as usize);
-        let Some(stamp) = stamp.filter(|_| u64::from(index) < file.records) else {
+        let in_file = u64::from(index) < file.records;
+        let touched = in_file.then(|| file.touch(page, pack, receivers)).flatten();
+        let Some(newly) = touched else {
             let text = format!("{} {index} of {}", file.kind, file.records);
             return Err(self.fail(Fault(FailureKind::Corrupt, text)));
         };
-        if *stamp != receiver {
-            *stamp = receiver;
-            self.counters.traversal_bytes += file.page_bytes;
-        }
+        self.counters.traversal_bytes += u64::from(newly) * file.page_bytes;
         let first = page * file.records_per_page;
         let count = (file.records - u64::from(first)).min(u64::from(file.records_per_page)) as u32;
         if self.pages.cache.get(key).is_none() {
             self.load(key)?;
         }
-        let place = Place { key, first, count };
+        let before = self.places[kind as usize].filter(|place| place.key == key);
+        let place = Place {
+            key,
+            first,
+            count,
+            receivers: receivers | before.map_or(0, |place| place.receivers),
+        };
         self.places[kind as usize] = Some(place);
         Ok(place)
     }
@@ -245,21 +270,21 @@ impl<'a> PageSource<'a> {
 
 impl SceneSource for PageSource<'_> {
     #[inline]
-    fn node(&mut self, index: NodeIndex) -> Result<&NodeRecord, SourceError> {
+    fn node(&mut self, index: NodeIndex, receivers: u8) -> Result<&NodeRecord, SourceError> {
         const BYTES: usize = size_of::<NodeRecord>();
-        let place = self.place(PageKind::Node, index.0)?;
+        let place = self.place(PageKind::Node, index.0, receivers)?;
         let start = (index.0 - place.first) as usize * BYTES;
         let bytes = self.bytes(place, start, start + BYTES)?;
         bytemuck::try_from_bytes(bytes).map_err(|_| lost(place))
     }
 
     #[inline]
-    fn points(&mut self, first: PointIndex, count: u32) -> Result<&[PointRecord], SourceError> {
+    fn points(&mut self, first: PointIndex, count: u32, receivers: u8) -> Result<&[PointRecord], SourceError> {
         const BYTES: usize = size_of::<PointRecord>();
         if count == 0 {
             return Err(self.fail(Fault(FailureKind::Corrupt, format!("no points from {} on", first.0))));
         }
-        let place = self.place(PageKind::Point, first.0)?;
+        let place = self.place(PageKind::Point, first.0, receivers)?;
         let slot = first.0 - place.first;
         let count = count.min(place.count - slot);
         let start = slot as usize * BYTES;
@@ -267,8 +292,8 @@ impl SceneSource for PageSource<'_> {
         bytemuck::try_cast_slice(bytes).map_err(|_| lost(place))
     }
 
-    fn begin_receiver(&mut self) {
-        self.scene.begin_receiver();
+    fn begin_pack(&mut self) {
+        self.scene.begin_pack();
         // The stamps are looked at when the page changes: have the next access look.
         self.places = [None; 2];
     }

@@ -84,13 +84,13 @@ fn every_index_gives_its_record_whatever_the_order() {
     let (mut pages, thread) = daemon(4);
     let mut view = SceneView::new(&scene(), MOUNT);
     let mut source = PageSource::new(&mut pages, &mut view, 1);
-    source.begin_receiver();
+    source.begin_pack();
     for step in 0..4000u64 {
         let node = (step * 37 % NODES) as u32;
-        assert_eq!(source.node(NodeIndex(node)).unwrap().centroid[0], node as f32);
+        assert_eq!(source.node(NodeIndex(node), 1).unwrap().centroid[0], node as f32);
         let point = (step * 53 % POINTS) as u32;
         if point / RECORDS_PER_PAGE != BAD_PAGE {
-            let points = source.points(PointIndex(point), 100).unwrap();
+            let points = source.points(PointIndex(point), 100, 1).unwrap();
             assert_eq!(points[0].position[0], point as f32);
             // Cut at the end of the page, and of the file.
             let rest = (RECORDS_PER_PAGE - point % RECORDS_PER_PAGE).min(POINTS as u32 - point);
@@ -108,21 +108,21 @@ fn an_index_out_of_range_is_corruption_not_a_panic() {
     let (mut pages, thread) = daemon(4);
     let mut view = SceneView::new(&scene(), MOUNT);
     let mut source = PageSource::new(&mut pages, &mut view, 1);
-    source.begin_receiver();
+    source.begin_pack();
     for index in [NODES as u32, NODES as u32 + 2, 1 << 20, u32::MAX] {
         assert!(
-            matches!(source.node(NodeIndex(index)), Err(SourceError::Corrupt(_))),
+            matches!(source.node(NodeIndex(index), 1), Err(SourceError::Corrupt(_))),
             "{index}"
         );
         assert_eq!(source.take_fault().unwrap().0, FailureKind::Corrupt);
     }
     for index in [POINTS as u32, u32::MAX] {
         assert!(
-            matches!(source.points(PointIndex(index), 1), Err(SourceError::Corrupt(_))),
+            matches!(source.points(PointIndex(index), 1, 1), Err(SourceError::Corrupt(_))),
             "{index}"
         );
     }
-    assert!(source.points(PointIndex(0), 0).is_err());
+    assert!(source.points(PointIndex(0), 0, 1).is_err());
     drop(pages);
     thread.join().unwrap();
 }
@@ -132,15 +132,15 @@ fn a_damaged_page_fails_with_the_daemons_words() {
     let (mut pages, thread) = daemon(4);
     let mut view = SceneView::new(&scene(), MOUNT);
     let mut source = PageSource::new(&mut pages, &mut view, 1);
-    source.begin_receiver();
+    source.begin_pack();
     let bad = PointIndex(BAD_PAGE * RECORDS_PER_PAGE);
-    let error = source.points(bad, 1).unwrap_err();
+    let error = source.points(bad, 1, 1).unwrap_err();
     assert!(matches!(error, SourceError::Corrupt(_)), "{error}");
     let (kind, text) = source.take_fault().unwrap();
     assert_eq!(kind, FailureKind::Corrupt);
     assert!(text.contains("checksum"), "{text}");
     // The next page is unaffected.
-    assert!(source.points(PointIndex(0), 1).is_ok());
+    assert!(source.points(PointIndex(0), 1, 1).is_ok());
     drop(pages);
     thread.join().unwrap();
 }
@@ -152,9 +152,9 @@ fn counters_add_up_and_a_receiver_pays_for_a_page_once() {
     let page_bytes = (NODE_BYTES * RECORDS_PER_PAGE as usize) as u64;
     {
         let mut source = PageSource::new(&mut pages, &mut view, 1);
-        source.begin_receiver();
+        source.begin_pack();
         for index in [0, 1, 20, 2] {
-            source.node(NodeIndex(index)).unwrap();
+            source.node(NodeIndex(index), 1).unwrap();
         }
         let counters = source.counters();
         assert_eq!(
@@ -163,13 +163,13 @@ fn counters_add_up_and_a_receiver_pays_for_a_page_once() {
         );
         assert_eq!(counters.traversal_bytes, 2 * page_bytes);
         assert!(counters.io_nanos > 0);
-        source.begin_receiver();
-        source.node(NodeIndex(3)).unwrap();
+        source.begin_pack();
+        source.node(NodeIndex(3), 1).unwrap();
         assert_eq!(source.counters().traversal_bytes, 3 * page_bytes);
     }
     let mut source = PageSource::new(&mut pages, &mut view, 2);
-    source.begin_receiver();
-    source.node(NodeIndex(4)).unwrap();
+    source.begin_pack();
+    source.node(NodeIndex(4), 1).unwrap();
     let counters = source.counters();
     assert_eq!(
         (counters.cache_misses, counters.local_hits),

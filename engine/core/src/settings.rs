@@ -120,6 +120,11 @@ impl ShadeSettings {
     /// Rasters are rows of one machine word in blocks of eight.
     const RESOLUTIONS: [u32; 4] = [8, 16, 32, 64];
 
+    /// Whether the distance of a surface decides how much it occludes.
+    pub fn weighs_distance(&self) -> bool {
+        self.max_dist < f32::INFINITY || self.falloff > 0.0
+    }
+
     /// Checks every range.
     ///
     /// # Errors

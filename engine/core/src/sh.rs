@@ -15,24 +15,23 @@ pub const COSINE_FACTORS: [f32; SH_TERMS] = {
     [l0, l1, l1, l1, l2, l2, l2, l2, l2]
 };
 
+/// Constants of the basis functions: of Y00, of the linear ones, of the products of two coordinates, of Y20 and of Y22.
+pub const BASIS_FACTORS: [f32; 5] = [0.282_094_8, 0.488_602_5, 1.092_548_4, 0.315_391_57, 0.546_274_2];
+
 /// The nine basis functions in direction `d` (unit): Y00, Y1-1, Y10, Y11, Y2-2, Y2-1, Y20, Y21, Y22.
 #[inline]
 pub fn basis(d: Vec3) -> [f32; SH_TERMS] {
-    const C0: f32 = 0.282_094_8;
-    const C1: f32 = 0.488_602_5;
-    const C2: f32 = 1.092_548_4;
-    const C3: f32 = 0.315_391_57;
-    const C4: f32 = 0.546_274_2;
+    let [constant, linear, product, zonal, square] = BASIS_FACTORS;
     [
-        C0,
-        C1 * d.y,
-        C1 * d.z,
-        C1 * d.x,
-        C2 * d.x * d.y,
-        C2 * d.y * d.z,
-        C3 * (3.0 * d.z * d.z - 1.0),
-        C2 * d.x * d.z,
-        C4 * (d.x * d.x - d.y * d.y),
+        constant,
+        linear * d.y,
+        linear * d.z,
+        linear * d.x,
+        product * d.x * d.y,
+        product * d.y * d.z,
+        zonal * (3.0 * d.z * d.z - 1.0),
+        product * d.x * d.z,
+        square * (d.x * d.x - d.y * d.y),
     ]
 }
 

@@ -20,6 +20,7 @@ pub mod light;
 pub mod limits;
 pub mod ply;
 pub mod procedural;
+pub mod raycast;
 pub mod scene;
 
 mod charts;
@@ -44,5 +45,6 @@ pub use light::{Light, LightKind};
 pub use open::{Density, Input, InputOptions, SampleOptions, ViewDensity, open_input, origin_of};
 pub use ply::{PlyForm, write_point_ply};
 pub use procedural::{Kind, ProceduralScene};
+pub use raycast::RayCast;
 pub use sample::MeshPoints;
 pub use scene::MeshScene;

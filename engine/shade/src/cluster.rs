@@ -1,13 +1,14 @@
-//! A node as a receiver sees it: whether it may stand for what is below it, and where its surface lies.
+//! A node as receivers see it: whether it may stand for what is below it, and where its surface lies.
 
-use crate::cut::Visit;
-use crate::footprint::SectionBox;
-use crate::shader::Receiver;
+use crate::leaf::along_faces;
+use crate::simd::{Floats, Words};
+use crate::vector::Vector;
 use glam::{Vec2, Vec3};
 use half::slice::HalfFloatSliceExt;
+use pbgi_core::NodeRecord;
+use pbgi_core::cluster::separate_sides;
 use pbgi_core::pack::area_normaliser;
-use pbgi_core::sh::{SH_TERMS, basis};
-use pbgi_core::{NodeRecord, ShadeSettings};
+use pbgi_core::sh::{BASIS_FACTORS, SH_TERMS, basis};
 
 /// Zonal factor of the clamped cosine times Y00: the first area term of a cluster over its area.
 const AREA_TERM: f32 = 0.886_226_9;
@@ -22,7 +23,7 @@ pub(crate) const SECTION_FILL: f32 = 0.7;
 /// Share of the accepted solid angle at which clusters without a plane are accepted: their silhouette is a guess.
 const ROUND_SHARE: f32 = 0.2;
 /// Cosine between normals from which a disc is taken for the receiver's own surface.
-const SAME_SURFACE: f32 = 0.7;
+pub(crate) const SAME_SURFACE: f32 = 0.7;
 /// The same for elements that the receiver nearly touches, facing the same way; shading normals lean, and folds turn within
 /// an element.
 const SAME_SHEET: f32 = 0.5;
@@ -32,9 +33,11 @@ const SHEET_DEPTH: f32 = 0.15;
 const INSIDE_DEPTH: f32 = 0.08;
 /// How far from an arc through both a receiver and an element may stand, as a sine.
 const ARC_SLACK: f32 = 0.15;
-/// Distance in voxel edges, and in radii of a disc, within which an element may be the receiver's own surface.
+/// Distance in voxel edges within which a cluster may be the receiver's own surface.
 const NEAR_VOXELS: f32 = 2.5;
 
+/// A uniform segment reaches the square root of three standard deviations.
+const UNIFORM_REACH: f32 = 1.732_051;
 /// How far a section reaches beyond a uniform covering with the points' variance, which a few points know only roughly ...
 const REACH_SCALE: f32 = 1.15;
 /// ... and beyond that, in radii.
@@ -42,36 +45,29 @@ const REACH_RADII: f32 = 0.5;
 /// Overlap of sections with their neighbours, as a share of half a voxel's edge, for a spread of 1.
 const SECTION_OVERLAP: f32 = 0.1;
 
-/// A node in plain numbers, seen from one receiver.
-pub(crate) struct Cluster {
-    /// Relative to the receiver.
+/// A node in plain numbers.
+pub(crate) struct Cluster<'a> {
+    node: &'a NodeRecord,
     pub(crate) centroid: Vec3,
-    pub(crate) distance_squared: f32,
     pub(crate) axis: Vec3,
     /// Covariance, square world units: xx, yy, zz, xy, xz, yz.
     pub(crate) covariance: [f32; 6],
     pub(crate) area: f32,
     pub(crate) fill: f32,
-    /// How far it reaches before and behind its centroid, as the receiver sees it.
-    pub(crate) depth: f32,
+    /// Edge of the voxel.
+    edge: f32,
     /// Root mean square sine between normals and axis.
     spread: f32,
     /// Largest radius of a point, nearly.
     radius: f32,
+    /// A piece of a plane.
     pub(crate) flat: bool,
-    /// Receiver within the voxel's sphere.
-    pub(crate) close: bool,
-    /// The receiver's own surface passes here.
-    pub(crate) own_surface: bool,
     pub(crate) normaliser: f32,
-    sh: [[half::f16; 4]; SH_TERMS],
 }
 
-impl Cluster {
+impl<'a> Cluster<'a> {
     #[inline(always)]
-    pub(crate) fn new(node: &NodeRecord, visit: &Visit, receiver: &Receiver) -> Self {
-        let edge = 2.0 * visit.half;
-        let centroid = Vec3::from(node.centroid) - receiver.position;
+    pub(crate) fn new(node: &'a NodeRecord, edge: f32) -> Self {
         let axis = node.axis();
         let mut covariance = [0.0; 6];
         node.covariance.as_slice().convert_to_f32_slice(&mut covariance);
@@ -80,99 +76,171 @@ impl Cluster {
         }
         let normaliser = area_normaliser(edge);
         let across = quadratic_form(&covariance, axis).max(0.0).sqrt();
-        let flat = node.spread() < FLAT_SPREAD && across < FLAT_THICKNESS * edge;
-        let inside = visit.center.abs().max_element() <= visit.half * 1.01;
-        let near = centroid.length_squared() < NEAR_VOXELS * NEAR_VOXELS * edge * edge;
-        let own_surface = flat
-            && near
-            && (is_own_surface(receiver.normal, axis, centroid, edge)
-                || (inside && is_aligned(receiver.normal, axis) && axis.dot(centroid).abs() < INSIDE_DEPTH * edge));
-        let along = quadratic_form(&covariance, centroid.normalize_or_zero()).max(0.0);
         Self {
-            centroid,
-            // A uniform segment reaches the square root of three standard deviations.
-            depth: (3.0 * along).sqrt(),
-            distance_squared: centroid.length_squared(),
+            node,
+            centroid: node.centroid.into(),
             axis,
             covariance,
             area: node.sh[0][0].to_f32() * normaliser / AREA_TERM,
             fill: node.fill(),
+            edge,
             spread: node.spread(),
             radius: node.radius_ratio() * edge,
-            flat,
-            close: visit.center.length_squared() < 3.0 * visit.half * visit.half * 1.2,
-            own_surface,
+            flat: node.spread() < FLAT_SPREAD && across < FLAT_THICKNESS * edge,
             normaliser,
-            sh: node.sh,
         }
     }
 
-    /// The part of the voxel that a flat cluster's surface reaches. Sections of neighbours on a curved surface lie in
-    /// different planes, so they are made to overlap; a surface that ends inside the voxel ends where its points do.
+    /// Whether it is drawn as the section of its voxel by its plane.
     #[inline(always)]
-    pub(crate) fn section_box(&self, visit: &Visit) -> SectionBox {
+    pub(crate) fn fills_section(&self) -> bool {
+        self.flat && self.fill >= SECTION_FILL
+    }
+
+    /// How far the section's box reaches from the voxel's centre, and from the centroid: the box is what both contain.
+    /// Sections of neighbours on a curved surface lie in different planes, so they are made to overlap; a surface that ends
+    /// inside the voxel ends where its points do.
+    #[inline(always)]
+    pub(crate) fn section_reach(&self) -> (Vec3, Vec3) {
         let variance = Vec3::new(self.covariance[0], self.covariance[1], self.covariance[2]).max(Vec3::ZERO);
-        // A uniform segment reaches the square root of three standard deviations.
-        let spread = Vec3::new(variance.x.sqrt(), variance.y.sqrt(), variance.z.sqrt()) * 1.732_051;
-        let reach = spread * REACH_SCALE + Vec3::splat(REACH_RADII * self.radius);
-        let slack = SECTION_OVERLAP * self.spread;
-        SectionBox::voxel(visit.center, visit.half, self.axis, slack)
-            .within(self.centroid - reach, self.centroid + reach)
+        let deviation = Vec3::new(variance.x.sqrt(), variance.y.sqrt(), variance.z.sqrt());
+        let of_points = deviation * (UNIFORM_REACH * REACH_SCALE) + Vec3::splat(REACH_RADII * self.radius);
+        let half = 0.5 * self.edge;
+        let of_voxel = (Vec3::splat(1.0 + SECTION_OVERLAP * self.spread) + along_faces(self.axis)) * half;
+        (of_voxel, of_points)
     }
 
-    /// Whether the cluster may stand for what is below it.
+    /// Squared distance beyond which it may stand for what is below it.
     #[inline(always)]
-    pub(crate) fn small_enough(&self, settings: &ShadeSettings, leaf: bool) -> bool {
-        let area = self.area.min(self.normaliser);
-        if self.flat {
-            let whole = leaf && self.fill >= SECTION_FILL;
-            whole || (!self.close && area < settings.max_solid_angle * self.distance_squared)
-        } else {
-            !self.close && area < ROUND_SHARE * settings.max_solid_angle * self.distance_squared
+    pub(crate) fn accepted_from_squared(&self, max_solid_angle: f32) -> f32 {
+        let share = if self.flat { 1.0 } else { ROUND_SHARE };
+        self.area.min(self.normaliser) / (share * max_solid_angle)
+    }
+
+    /// The lanes in which a flat cluster is the receiver's own surface; `normal` is the receiver's, `centroid` and `center`
+    /// (the voxel's) are relative to it.
+    #[inline(always)]
+    pub(crate) fn own_surface<F: Floats>(&self, normal: Vector<F>, centroid: Vector<F>, center: Vector<F>) -> u8 {
+        let axis = Vector::splat(self.axis);
+        let near = centroid
+            .length_squared()
+            .less(F::splat(NEAR_VOXELS * NEAR_VOXELS * self.edge * self.edge));
+        if near.lanes() == 0 {
+            return 0;
         }
+        let inside = center.max_abs().less(F::splat(0.505 * self.edge));
+        let in_plane = axis.dot(centroid).abs().less(F::splat(INSIDE_DEPTH * self.edge));
+        let within = inside & in_plane & is_aligned(normal, axis);
+        (near & (within | is_own_surface(normal, axis, centroid, self.edge))).lanes()
     }
 
-    /// Power of the terms toward a direction: area, r, g, b over the normaliser.
+    /// Squared reach before and behind its centroid along unit directions.
     #[inline(always)]
-    pub(crate) fn evaluate(&self, direction: Vec3) -> ([f32; 4], [f32; 4]) {
-        let mut sh = [0.0f32; 4 * SH_TERMS];
-        let halves: &[half::f16] = bytemuck::cast_slice(&self.sh);
-        halves.convert_to_f32_slice(&mut sh);
-        let y = basis(direction);
-        // Even and odd bands apart: their sum looks along the direction, their difference against it.
-        let (mut even, mut odd) = ([0.0f32; 4], [0.0f32; 4]);
+    pub(crate) fn depth<F: Floats>(&self, direction: Vector<F>) -> F {
+        let along = direction.dot(multiply(&self.covariance, direction));
+        (along.max(F::splat(0.0)) * F::splat(3.0)).sqrt()
+    }
+
+    fn terms(&self) -> [f32; 4 * SH_TERMS] {
+        let mut terms = [0.0f32; 4 * SH_TERMS];
+        let halves: &[half::f16] = bytemuck::cast_slice(&self.node.sh);
+        halves.convert_to_f32_slice(&mut terms);
+        terms
+    }
+
+    /// Power of a flat cluster's two sides: radiance times area, the side of the axis first.
+    #[inline(never)]
+    pub(crate) fn side_powers(&self) -> [Vec3; 2] {
+        let terms = self.terms();
+        let y = basis(self.axis);
+        // Even and odd bands apart: their sum looks along the axis, their difference against it.
+        let (mut even, mut odd) = (Vec3::ZERO, Vec3::ZERO);
         for (term, y) in y.iter().enumerate() {
             let sum = if (1..4).contains(&term) { &mut odd } else { &mut even };
-            for channel in 0..4 {
-                sum[channel] += sh[term * 4 + channel] * y;
-            }
+            *sum += Vec3::new(terms[term * 4 + 1], terms[term * 4 + 2], terms[term * 4 + 3]) * *y;
         }
-        (even, odd)
+        let (front, back) = separate_sides(even + odd, even - odd);
+        [front * self.normaliser, back * self.normaliser]
     }
+
+    /// Projected area of both sides of all discs, and power, toward unit directions.
+    #[inline(always)]
+    pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>) -> (F, Vector<F>) {
+        let terms = self.terms();
+        let y = basis_of(direction);
+        let (zero, scale) = (F::splat(0.0), F::splat(self.normaliser));
+        // Both sides: twice the even bands.
+        let [even, _] = bands(&terms, &y, 0);
+        let area = (even + even).max(zero) * scale;
+        let [red, green, blue] = [bands(&terms, &y, 1), bands(&terms, &y, 2), bands(&terms, &y, 3)];
+        let power = Vector {
+            x: (red[0] + red[1]).max(zero) * scale,
+            y: (green[0] + green[1]).max(zero) * scale,
+            z: (blue[0] + blue[1]).max(zero) * scale,
+        };
+        (area, power)
+    }
+}
+
+/// Sums of the even and of the odd bands of a channel.
+#[inline(always)]
+fn bands<F: Floats>(terms: &[f32; 4 * SH_TERMS], y: &[F; SH_TERMS], channel: usize) -> [F; 2] {
+    let (mut even, mut odd) = (F::splat(0.0), F::splat(0.0));
+    for (term, y) in y.iter().enumerate() {
+        let add = F::splat(terms[term * 4 + channel]) * *y;
+        if (1..4).contains(&term) {
+            odd = odd + add;
+        } else {
+            even = even + add;
+        }
+    }
+    [even, odd]
+}
+
+/// The nine basis functions in unit directions; see [`basis`].
+#[inline(always)]
+fn basis_of<F: Floats>(d: Vector<F>) -> [F; SH_TERMS] {
+    let [constant, linear, product, zonal, square] = BASIS_FACTORS.map(F::splat);
+    [
+        constant,
+        linear * d.y,
+        linear * d.z,
+        linear * d.x,
+        product * d.x * d.y,
+        product * d.y * d.z,
+        zonal * (F::splat(3.0) * d.z * d.z - F::splat(1.0)),
+        product * d.x * d.z,
+        square * (d.x * d.x - d.y * d.y),
+    ]
 }
 
 #[inline(always)]
-pub(crate) fn is_aligned(a: Vec3, b: Vec3) -> bool {
-    a.dot(b).abs() > SAME_SURFACE
+pub(crate) fn is_aligned<F: Floats>(a: Vector<F>, b: Vector<F>) -> F::Words {
+    F::splat(SAME_SURFACE).less(a.dot(b).abs())
 }
 
-/// Whether a near element at `center` with `normal`, `size` wide, is the receiver's own surface, which only the flatness of
+/// Whether near elements at `center` with `normal`, `size` wide, are the receivers' own surface, which only the flatness of
 /// the element lifts above the receiver: the receiver is behind it, and either close to its plane for its size, or both
 /// normals stand on one arc. On a circle the chord makes equal and opposite angles with the normals at its ends.
 #[inline(always)]
-pub(crate) fn is_own_surface(receiver_normal: Vec3, normal: Vec3, center: Vec3, size: f32) -> bool {
+pub(crate) fn is_own_surface<F: Floats>(
+    receiver_normal: Vector<F>,
+    normal: Vector<F>,
+    center: Vector<F>,
+    size: f32,
+) -> F::Words {
     let facing = normal.dot(receiver_normal);
     // A sheet may be seen from its back.
-    let normal = if facing < 0.0 { -normal } else { normal };
-    let behind = normal.dot(center);
+    let behind = normal.dot(center) * F::splat(1.0).copysign(facing);
+    let chord = (behind + receiver_normal.dot(center)).abs();
     let on_arc =
-        facing.abs() > SAME_SURFACE && (behind + receiver_normal.dot(center)).abs() < ARC_SLACK * center.length();
-    let in_depth = facing > SAME_SHEET && behind < SHEET_DEPTH * size;
-    behind >= 0.0 && (on_arc || in_depth)
+        F::splat(SAME_SURFACE).less(facing.abs()) & chord.less(F::splat(ARC_SLACK) * center.length_squared().sqrt());
+    let in_depth = F::splat(SAME_SHEET).less(facing) & behind.less(F::splat(SHEET_DEPTH * size));
+    !behind.less(F::splat(0.0)) & (on_arc | in_depth)
 }
 
 #[inline(always)]
-pub(crate) fn quadratic_form(m: &[f32; 6], v: Vec3) -> f32 {
+fn quadratic_form(m: &[f32; 6], v: Vec3) -> f32 {
     m[0] * v.x * v.x
         + m[1] * v.y * v.y
         + m[2] * v.z * v.z
@@ -180,31 +248,56 @@ pub(crate) fn quadratic_form(m: &[f32; 6], v: Vec3) -> f32 {
 }
 
 #[inline(always)]
-pub(crate) fn multiply(m: &[f32; 6], v: Vec3) -> Vec3 {
-    Vec3::new(
-        m[0] * v.x + m[3] * v.y + m[4] * v.z,
-        m[3] * v.x + m[1] * v.y + m[5] * v.z,
-        m[4] * v.x + m[5] * v.y + m[2] * v.z,
-    )
+fn multiply<F: Floats>(m: &[f32; 6], v: Vector<F>) -> Vector<F> {
+    let [xx, yy, zz, xy, xz, yz] = m.map(F::splat);
+    Vector {
+        x: xx * v.x + xy * v.y + xz * v.z,
+        y: xy * v.x + yy * v.y + yz * v.z,
+        z: xz * v.x + yz * v.y + zz * v.z,
+    }
 }
 
-/// Axes and half extents of the rectangle in the plane across `normal` whose uniform covering has this covariance.
+/// Axes and half extents of the rectangles in the planes across unit `normal`s whose uniform covering has this covariance.
 #[inline(always)]
-pub(crate) fn rectangle_of(covariance: &[f32; 6], normal: Vec3) -> [(Vec3, f32); 2] {
-    let (u, v) = normal.any_orthonormal_pair();
+pub(crate) fn rectangle_of<F: Floats>(covariance: &[f32; 6], normal: Vector<F>) -> [(Vector<F>, F); 2] {
+    let [u, v] = orthonormal_pair(normal);
     let (cu, cv) = (multiply(covariance, u), multiply(covariance, v));
     let (a, b, c) = (u.dot(cu), u.dot(cv), v.dot(cv));
-    let middle = 0.5 * (a + c);
-    let reach = (0.25 * (a - c) * (a - c) + b * b).sqrt();
-    let (large, small) = (middle + reach, (middle - reach).max(0.0));
-    let turn = if (large - c).abs() + b.abs() > 1e-12 * large {
-        Vec2::new(large - c, b)
-    } else {
-        Vec2::X
-    };
-    let turn = turn.normalize_or(Vec2::X);
-    let first = u * turn.x + v * turn.y;
-    let second = v * turn.x - u * turn.y;
+    let (half, zero) = (F::splat(0.5), F::splat(0.0));
+    let middle = half * (a + c);
+    let reach = (half * half * (a - c) * (a - c) + b * b).sqrt();
+    let (large, small) = (middle + reach, (middle - reach).max(zero));
+    // The eigenvector of the larger; any where both are equal.
+    let lean = large - c;
+    let tilted = (F::splat(1e-12) * large).less(lean.abs() + b.abs());
+    let length = (lean * lean + b * b).sqrt();
+    let regular = tilted & F::splat(f32::MIN_POSITIVE).less(length);
+    let turn_u = regular.select(lean / length, F::splat(Vec2::X.x));
+    let turn_v = regular.select(b / length, zero);
+    let first = u * turn_u + v * turn_v;
+    let second = v * turn_u - u * turn_v;
     // A uniform segment of half length h has variance h^2 / 3.
-    [(first, (3.0 * large).sqrt()), (second, (3.0 * small).sqrt())]
+    let three = F::splat(3.0);
+    [(first, (three * large).sqrt()), (second, (three * small).sqrt())]
+}
+
+/// Two unit vectors across unit normals and each other (Duff et al. 2017, "Building an Orthonormal Basis, Revisited").
+#[inline(always)]
+pub(crate) fn orthonormal_pair<F: Floats>(n: Vector<F>) -> [Vector<F>; 2] {
+    let one = F::splat(1.0);
+    let sign = one.copysign(n.z);
+    let a = -one / (sign + n.z);
+    let b = n.x * n.y * a;
+    [
+        Vector {
+            x: one + sign * n.x * n.x * a,
+            y: sign * b,
+            z: -(sign * n.x),
+        },
+        Vector {
+            x: b,
+            y: sign + n.y * n.y * a,
+            z: -n.y,
+        },
+    ]
 }

@@ -1,14 +1,19 @@
 //! Cut picking: a depth-first walk of the octree, near octants first, that ends where clusters are small enough, and rasters
 //! what it ends on (paper section 5; Christensen 2008, section 3.3).
+//!
+//! Eight receivers walk together. Each decides for itself at every node, and receivers that would visit children in another
+//! order part, so that what a receiver gets does not depend on its company.
 
 use crate::cluster::Cluster;
 use crate::frame::Frame;
+use crate::leaf::{Cube, Part, take_apart};
 use crate::painter::Painter;
 use crate::raster::{Raster, RasterTables};
 use crate::shader::{Receiver, ShadeCounters, ShadeError};
-use crate::simd::Simd;
+use crate::simd::{Floats, LANES, Words};
 use crate::source::{SceneSource, SourceError};
-use glam::Vec3;
+use crate::vector::{Frames, Vector};
+use glam::{DVec3, Vec3};
 use pbgi_core::limits::{CUT_NODES_MAX, MORTON_BITS};
 use pbgi_core::{NodeIndex, NodeKind, NodeRecord, PointIndex, PointRecord, SceneInfo, ShadeSettings};
 
@@ -20,108 +25,179 @@ pub(crate) struct Walk<'a> {
     pub(crate) info: &'a SceneInfo,
     pub(crate) settings: &'a ShadeSettings,
     pub(crate) tables: &'a RasterTables,
-    pub(crate) simd: Simd,
 }
 
-/// A voxel to visit; positions relative to the receiver.
+/// Eight receivers, world space. Lanes without a receiver repeat another.
+pub(crate) struct Pack<F> {
+    position: Vector<F>,
+    pub(crate) frames: Frames<F>,
+    /// Lanes with a receiver, one bit each.
+    lanes: u8,
+    /// The root's centre relative to the receivers.
+    root: Vector<F>,
+}
+
+/// A voxel to visit.
 #[derive(Clone, Copy)]
 pub(crate) struct Visit {
     pub(crate) index: NodeIndex,
-    pub(crate) center: Vec3,
+    /// Centre relative to the root's.
+    pub(crate) offset: Vec3,
     pub(crate) half: f32,
     pub(crate) level: u32,
     /// Path from the root, which names the voxel whatever the layout of the file.
     pub(crate) path: u64,
     /// Upper bound of the radii of its points.
     pub(crate) radius: f32,
+    /// Receivers that visit it, one bit each.
+    pub(crate) lanes: u8,
 }
 
 /// Memory that walks use again and again.
 #[derive(Default)]
 pub(crate) struct Scratch {
     stack: Vec<Visit>,
-    discs: Vec<(f32, PointRecord)>,
+    points: Vec<PointRecord>,
+    parts: Vec<Part>,
+    order: Vec<(f32, u32)>,
 }
 
-/// What one receiver sees: sums over bits.
-#[derive(Clone, Copy, Default)]
-pub(crate) struct Seen {
-    /// Radiance, bit by bit.
-    pub(crate) radiance: Vec3,
-    /// Occlusion weight, bit by bit.
-    pub(crate) occlusion: f32,
+/// What eight receivers see: sums over bits.
+pub(crate) struct Seen<F> {
+    pub(crate) radiance: Vector<F>,
+    pub(crate) occlusion: F,
 }
 
-/// Walks the octree for one receiver and fills its raster.
-pub(crate) fn gather<S: SceneSource>(
+impl<F: Floats> Pack<F> {
+    /// Up to eight receivers with unit normals.
+    #[inline(always)]
+    pub(crate) fn new(info: &SceneInfo, receivers: &[Receiver], frames: &[Frame; LANES]) -> Self {
+        let receiver = |lane: usize| receivers[lane.min(receivers.len() - 1)];
+        let middle = info.quantizer.map_or(DVec3::ZERO, |quantizer| {
+            DVec3::from(quantizer.origin) + DVec3::splat(quantizer.edge / 2.0)
+        });
+        let root = |lane: usize| (middle - receiver(lane).position.as_dvec3()).as_vec3();
+        Self {
+            position: Vector::from_array(std::array::from_fn(|lane| receiver(lane).position)),
+            frames: Frames::new(frames),
+            lanes: (u8::MAX as u32 >> (LANES - receivers.len().min(LANES))) as u8,
+            root: Vector::from_array(std::array::from_fn(root)),
+        }
+    }
+
+    /// A place of the world, relative to the receivers.
+    #[inline(always)]
+    pub(crate) fn relative(&self, place: Vec3) -> Vector<F> {
+        Vector::splat(place) - self.position
+    }
+}
+
+/// Walks the octree for a pack of receivers and fills their rasters.
+#[inline(always)]
+pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
     walk: &Walk<'_>,
-    receiver: &Receiver,
-    frame: &Frame,
+    pack: &Pack<F>,
     source: &mut S,
-    raster: &mut Raster,
+    raster: &mut Raster<F, WORDS>,
     scratch: &mut Scratch,
     counters: &mut ShadeCounters,
-) -> Result<Seen, ShadeError> {
-    let (Some(root), Some(quantizer)) = (walk.info.root, walk.info.quantizer) else {
-        return Ok(Seen::default());
-    };
-    let half = quantizer.edge / 2.0;
-    let center = [0, 1, 2].map(|axis| (quantizer.origin[axis] + half - f64::from(receiver.position[axis])) as f32);
-    let mut painter = Painter {
-        walk,
-        frame,
-        raster,
-        seen: Seen::default(),
-    };
-    scratch.stack.clear();
-    let radius = walk.info.radius_max;
-    scratch.stack.push(Visit {
-        index: root,
-        center: center.into(),
-        half: half as f32,
-        level: 0,
-        path: 0,
-        radius,
+) -> Result<Seen<F>, ShadeError> {
+    let mut painter = Painter::new(walk, pack, raster);
+    let Scratch {
+        stack,
+        points,
+        parts,
+        order,
+    } = scratch;
+    stack.clear();
+    if let (Some(root), Some(quantizer)) = (walk.info.root, walk.info.quantizer) {
+        stack.push(Visit {
+            index: root,
+            offset: Vec3::ZERO,
+            half: (quantizer.edge / 2.0) as f32,
+            level: 0,
+            path: 0,
+            radius: walk.info.radius_max,
+            lanes: pack.lanes,
+        });
+    }
+    let middle = walk.info.quantizer.map_or(DVec3::ZERO, |quantizer| {
+        DVec3::from(quantizer.origin) + DVec3::splat(quantizer.edge / 2.0)
     });
-    let mut visited = 0u32;
-    while let Some(visit) = scratch.stack.pop() {
-        if painter.culls(&visit) {
+    let mut visited = F::Words::splat(0);
+    while let Some(visit) = stack.pop() {
+        let center = pack.root + Vector::splat(visit.offset);
+        let lanes = painter.seen_by(&visit, center);
+        if lanes == 0 {
             continue;
         }
-        visited += 1;
-        if visited > CUT_NODES_MAX {
+        visited = visited.wrapping_sub(F::Words::from_lanes(lanes));
+        if visited.greater_signed(F::Words::splat(CUT_NODES_MAX)).lanes() != 0 {
             return Err(ShadeError::Budget { nodes: CUT_NODES_MAX });
         }
-        let node = *source.node(visit.index)?;
+        let lane_count = u64::from(lanes.count_ones());
+        counters.nodes_visited += lane_count;
+        let node = *source.node(visit.index, lanes)?;
         check(&node, &visit, walk.info.settings.leaf_max)?;
-        let cluster = Cluster::new(&node, &visit, receiver);
-        match node.kind() {
-            NodeKind::Overflow { .. } => {
-                painter.draw_cluster(&cluster, &visit);
-                counters.cut_elements += 1;
+        let cluster = Cluster::new(&node, 2.0 * visit.half);
+        let centroid = pack.relative(cluster.centroid);
+        let kind = node.kind();
+        let whole = match kind {
+            NodeKind::Overflow { .. } => true,
+            NodeKind::Leaf { .. } => cluster.fills_section(),
+            NodeKind::Inner { .. } => false,
+        };
+        let accepted = if whole {
+            lanes
+        } else {
+            let apart = F::splat(3.6 * visit.half * visit.half).less(center.length_squared());
+            let from = F::splat(cluster.accepted_from_squared(walk.settings.max_solid_angle));
+            lanes & (apart & from.less(centroid.length_squared())).lanes()
+        };
+        if accepted != 0 {
+            counters.cut_elements += u64::from(accepted.count_ones());
+            painter.draw_cluster(&cluster, &visit, center, centroid, accepted);
+        }
+        let mut opened = lanes & !accepted;
+        if opened == 0 {
+            continue;
+        }
+        if let NodeKind::Leaf { first, count } = kind {
+            counters.cut_elements += u64::from(count) * u64::from(opened.count_ones());
+            read_points(source, first, count, opened, points)?;
+            let voxel = Cube {
+                center: (middle + visit.offset.as_dvec3()).as_vec3(),
+                half: visit.half,
+            };
+            take_apart(points, voxel, parts);
+        }
+        // The octant of the voxel that is nearest to a receiver.
+        let zero = F::splat(0.0);
+        let negative = [
+            center.x.less(zero).lanes(),
+            center.y.less(zero).lanes(),
+            center.z.less(zero).lanes(),
+        ];
+        while opened != 0 {
+            let lane = opened.trailing_zeros();
+            let mut together = opened;
+            let mut near = 0;
+            for (axis, negative) in negative.into_iter().enumerate() {
+                let side = negative >> lane & 1;
+                near |= u32::from(side) << axis;
+                together &= if side == 1 { negative } else { !negative };
             }
-            NodeKind::Inner { first, mask } => {
-                if cluster.small_enough(walk.settings, false) {
-                    painter.draw_cluster(&cluster, &visit);
-                    counters.cut_elements += 1;
-                } else {
-                    push_children(&mut scratch.stack, &visit, &node, first, mask);
-                }
-            }
-            NodeKind::Leaf { first, count } => {
-                if cluster.small_enough(walk.settings, true) {
-                    painter.draw_cluster(&cluster, &visit);
-                    counters.cut_elements += 1;
-                } else {
-                    read_discs(source, first, count, receiver, &mut scratch.discs)?;
-                    counters.cut_elements += u64::from(count);
-                    painter.draw_leaf(&scratch.discs, &visit, receiver);
-                }
+            opened &= !together;
+            match kind {
+                NodeKind::Inner { first, mask } => push_children(stack, &visit, &node, first, mask, near, together),
+                _ => painter.draw_parts(parts, order, &visit, near, together),
             }
         }
     }
-    counters.nodes_visited += u64::from(visited);
-    Ok(painter.seen)
+    Ok(Seen {
+        radiance: painter.radiance,
+        occlusion: painter.occlusion,
+    })
 }
 
 /// What a page says must fit where it was found: pages are checksummed, but a file may be forged.
@@ -142,11 +218,18 @@ fn check(node: &NodeRecord, visit: &Visit, leaf_max: u32) -> Result<(), SourceEr
     }
 }
 
+/// Pushes the children for receivers to whom octant `near` is the nearest, so that it is popped first.
 #[inline(always)]
-fn push_children(stack: &mut Vec<Visit>, visit: &Visit, node: &NodeRecord, first: NodeIndex, mask: u8) {
+fn push_children(
+    stack: &mut Vec<Visit>,
+    visit: &Visit,
+    node: &NodeRecord,
+    first: NodeIndex,
+    mask: u8,
+    near: u32,
+    lanes: u8,
+) {
     let radius = visit.radius.min(node.radius_ratio() * 2.0 * visit.half);
-    let near =
-        u32::from(visit.center.x < 0.0) | u32::from(visit.center.y < 0.0) << 1 | u32::from(visit.center.z < 0.0) << 2;
     let half = visit.half * 0.5;
     for step in NEAR_TO_FAR.iter().rev() {
         let octant = near ^ step;
@@ -157,35 +240,29 @@ fn push_children(stack: &mut Vec<Visit>, visit: &Visit, node: &NodeRecord, first
         let side = |bit: u32| if octant >> bit & 1 == 1 { half } else { -half };
         stack.push(Visit {
             index: NodeIndex(first.0.wrapping_add(rank)),
-            center: visit.center + Vec3::new(side(0), side(1), side(2)),
+            offset: visit.offset + Vec3::new(side(0), side(1), side(2)),
             half,
             level: visit.level + 1,
             path: visit.path << 3 | u64::from(octant),
             radius,
+            lanes,
         });
     }
 }
 
-/// Reads a leaf's points, nearest first.
+/// Reads a leaf's points.
 #[inline(always)]
-fn read_discs<S: SceneSource>(
+fn read_points<S: SceneSource>(
     source: &mut S,
     first: PointIndex,
     count: u32,
-    receiver: &Receiver,
-    discs: &mut Vec<(f32, PointRecord)>,
+    lanes: u8,
+    points: &mut Vec<PointRecord>,
 ) -> Result<(), SourceError> {
-    discs.clear();
-    let mut read = 0;
-    while read < count {
-        let first = PointIndex(first.0.wrapping_add(read));
-        let points = source.points(first, count - read)?;
-        read += points.len() as u32;
-        discs.extend(points.iter().map(|point| {
-            let distance = Vec3::from(point.position).distance_squared(receiver.position);
-            (distance, *point)
-        }));
+    points.clear();
+    while (points.len() as u32) < count {
+        let read = points.len() as u32;
+        points.extend_from_slice(source.points(PointIndex(first.0.wrapping_add(read)), count - read, lanes)?);
     }
-    discs.sort_by(|a, b| a.0.total_cmp(&b.0));
     Ok(())
 }

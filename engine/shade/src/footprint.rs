@@ -1,98 +1,74 @@
-//! Footprints: the convex cones, seen from the receiver, in which a disc or a cluster hides what is behind it.
+//! Footprints: the convex cones, seen from the receivers, in which a disc or a cluster hides what is behind it.
 //!
 //! A footprint is a piece of a plane cut by slabs. The ray `d` meets the plane `n.x = k` at `k d / (n.d)`, so the slab
 //! `low <= a.x <= high` is the pair of half-spaces `(k a - low n).d >= 0` and `(high n - k a).d >= 0`: linear in `d`.
 
-use crate::frame::Frame;
-use crate::raster::LANES;
-use glam::Vec3;
+use crate::simd::{Floats, Words};
+use crate::vector::{Frames, Vector};
+use std::ops::Range;
 
 /// Half-spaces of the widest footprint: a section cut by two facets, or the octagon of a disc.
 const HALF_SPACES_MAX: usize = 8;
 /// Apothem of an octagon over the radius of the disc of equal area.
 const OCTAGON_APOTHEM: f32 = 0.973_68;
-/// Cosine between a plane's normal and an axis from which the plane counts as running along the faces across that axis.
-const ALONG_FACE: f32 = 0.9;
-/// How far such a plane may lie outside the voxel, as a share of its half edge.
-const FACE_SLACK: f32 = 0.05;
+/// Circumradius of that octagon over the disc's radius.
+const OCTAGON_REACH: f32 = 1.06;
 
-/// The half-space `x d.x + y d.y + z d.z >= 0` in the receiver's frame.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct HalfSpace {
-    pub(crate) inverse_x: f32,
-    pub(crate) y: f32,
-    pub(crate) z: f32,
+/// The half-space `x d.x + y d.y + z d.z >= 0` in the receiver's frame, as the bound that it puts on `tan a` in the row with
+/// angle `phi` (see [`crate::raster`]): `y sin phi + z cos phi`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct HalfSpace<F: Floats> {
+    pub(crate) y: F,
+    pub(crate) z: F,
+    /// Negative where the bound is an upper one.
+    pub(crate) sign: F::Words,
 }
 
 /// A convex cone with its apex at the receiver, in the receiver's frame.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Footprint {
-    half_spaces: [HalfSpace; HALF_SPACES_MAX],
+pub(crate) struct Footprint<F: Floats> {
+    half_spaces: [HalfSpace<F>; HALF_SPACES_MAX],
     len: usize,
     /// Sphere around the piece of plane.
-    center: Vec3,
-    radius: f32,
+    center: Vector<F>,
+    radius: F,
 }
 
-/// The plane of a footprint, on the far side of the receiver: `normal.x = distance`, `distance > 0`; world directions,
-/// positions relative to the receiver.
+/// The plane of a footprint, on the far side of the receiver: `normal.x = distance`, `distance > 0`; positions relative to
+/// the receiver, in its frame.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Plane {
-    pub(crate) normal: Vec3,
-    pub(crate) distance: f32,
+pub(crate) struct Plane<F> {
+    pub(crate) normal: Vector<F>,
+    pub(crate) distance: F,
 }
 
-/// The box in which a plane is drawn: a voxel, less the part that its points do not reach; relative to the receiver.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct SectionBox {
-    low: Vec3,
-    high: Vec3,
-}
-
-impl SectionBox {
-    /// A voxel, larger by the share `slack` of its half edge. A plane along a face must not fall out of it by rounding.
+impl<F: Floats> Plane<F> {
+    /// Through `point` (relative to the receiver) with `normal`, both in the world, turned away from the receiver. A receiver
+    /// within `touch` of the plane is taken to stand that far in front of it: at the foot of a wall the wall hides half of
+    /// the sky.
     #[inline(always)]
-    pub(crate) fn voxel(center: Vec3, half: f32, normal: Vec3, slack: f32) -> Self {
-        let along = normal.abs().cmpgt(Vec3::splat(ALONG_FACE));
-        let reach = Vec3::splat(half * (1.0 + slack)) + Vec3::select(along, Vec3::splat(half * FACE_SLACK), Vec3::ZERO);
-        Self {
-            low: center - reach,
-            high: center + reach,
-        }
-    }
-
-    /// The part between two corners.
-    #[inline(always)]
-    pub(crate) fn within(self, low: Vec3, high: Vec3) -> Self {
-        Self {
-            low: self.low.max(low),
-            high: self.high.min(high),
-        }
-    }
-}
-
-impl Plane {
-    /// Through `point` (relative to the receiver) with `normal`, turned away from the receiver. A receiver within `touch`
-    /// of the plane is taken to stand that far in front of it: at the foot of a wall the wall hides half of the sky.
-    #[inline(always)]
-    pub(crate) fn through(point: Vec3, normal: Vec3, touch: f32) -> Self {
+    pub(crate) fn through(frames: &Frames<F>, point: Vector<F>, normal: Vector<F>, touch: f32) -> Self {
         let distance = normal.dot(point);
-        if distance < touch {
-            Self {
-                normal: -normal,
-                distance: (-distance).max(touch),
-            }
-        } else {
-            Self { normal, distance }
+        let touch = F::splat(touch);
+        let behind = distance.less(touch);
+        let turn = behind.select(F::splat(-1.0), F::splat(1.0));
+        Self {
+            normal: frames.local_from_world(normal) * turn,
+            distance: (distance * turn).max(touch),
         }
     }
 }
 
-impl Footprint {
+impl<F: Floats> Footprint<F> {
     #[inline(always)]
-    fn empty(center: Vec3, radius: f32) -> Self {
+    fn empty(center: Vector<F>, radius: F) -> Self {
+        let none = HalfSpace {
+            y: F::splat(0.0),
+            z: F::splat(0.0),
+            sign: F::Words::splat(0),
+        };
         Self {
-            half_spaces: [HalfSpace::default(); HALF_SPACES_MAX],
+            half_spaces: [none; HALF_SPACES_MAX],
             len: 0,
             center,
             radius,
@@ -100,122 +76,129 @@ impl Footprint {
     }
 
     #[inline(always)]
-    pub(crate) fn half_spaces(&self) -> &[HalfSpace] {
+    pub(crate) fn half_spaces(&self) -> &[HalfSpace<F>] {
         &self.half_spaces[..self.len]
     }
 
     #[inline(always)]
-    fn add_half_space(&mut self, g: Vec3) {
+    fn add_half_space(&mut self, g: Vector<F>) {
         /// Keeps the division defined; a row is then inside or outside as a whole.
         const TINY: f32 = 1e-20;
-        let x = if g.x.abs() < TINY { TINY } else { g.x };
+        let tiny = F::splat(TINY);
+        let x = g.x.abs().less(tiny).select(tiny, g.x);
+        let scale = F::splat(-1.0) / x;
         self.half_spaces[self.len] = HalfSpace {
-            inverse_x: 1.0 / x,
-            y: g.y,
-            z: g.z,
+            y: g.y * scale,
+            z: g.z * scale,
+            sign: x.to_bits(),
         };
         self.len += 1;
     }
 
-    /// All vectors in the receiver's frame.
+    /// Everything in the receivers' frames.
     #[inline(always)]
-    fn add_slab(&mut self, normal: Vec3, distance: f32, axis: Vec3, low: f32, high: f32) {
-        self.add_half_space(axis * distance - normal * low);
-        self.add_half_space(normal * high - axis * distance);
+    fn add_slab(&mut self, plane: &Plane<F>, axis: Vector<F>, low: F, high: F) {
+        let axis = axis * plane.distance;
+        self.add_half_space(axis - plane.normal * low);
+        self.add_half_space(plane.normal * high - axis);
     }
 
-    /// A rectangle around `center` in the plane with `normal` at `distance`, given by unit axes and half extents; everything
-    /// in the receiver's frame.
+    /// A rectangle around `center` in a plane, given by unit axes and half extents; everything in the receivers' frames.
     #[inline(always)]
-    pub(crate) fn rectangle(center: Vec3, normal: Vec3, distance: f32, sides: [(Vec3, f32); 2]) -> Self {
-        let mut footprint = Self::empty(center, (sides[0].1 * sides[0].1 + sides[1].1 * sides[1].1).sqrt());
+    pub(crate) fn rectangle(center: Vector<F>, plane: &Plane<F>, sides: [(Vector<F>, F); 2]) -> Self {
+        let radius = (sides[0].1 * sides[0].1 + sides[1].1 * sides[1].1).sqrt();
+        let mut footprint = Self::empty(center, radius);
         for (axis, half) in sides {
             let middle = axis.dot(center);
-            footprint.add_slab(normal, distance, axis, middle - half, middle + half);
+            footprint.add_slab(plane, axis, middle - half, middle + half);
         }
         footprint
     }
 
-    /// The octagon with the area of a disc; `center` relative to the receiver, world directions.
+    /// The octagon with the area of a disc, given by two unit axes of its plane; everything in the receivers' frames.
     #[inline(always)]
-    pub(crate) fn disc(frame: &Frame, center: Vec3, plane: Plane, radius: f32) -> Self {
-        let (u, v) = plane.normal.any_orthonormal_pair();
-        let (u, v) = (frame.local_from_world(u), frame.local_from_world(v));
-        let normal = frame.local_from_world(plane.normal);
-        let center = frame.local_from_world(center);
-        let half = radius * OCTAGON_APOTHEM;
-        let mut footprint = Self::empty(center, radius * 1.06);
-        let (p, q) = (
-            (u + v) * std::f32::consts::FRAC_1_SQRT_2,
-            (u - v) * std::f32::consts::FRAC_1_SQRT_2,
-        );
-        for axis in [u, v, p, q] {
+    pub(crate) fn disc(center: Vector<F>, plane: &Plane<F>, axes: [Vector<F>; 2], radius: f32) -> Self {
+        let half = F::splat(radius * OCTAGON_APOTHEM);
+        let diagonal = F::splat(std::f32::consts::FRAC_1_SQRT_2);
+        let [u, v] = axes;
+        let mut footprint = Self::empty(center, F::splat(radius * OCTAGON_REACH));
+        for axis in [u, v, (u + v) * diagonal, (u - v) * diagonal] {
             let middle = axis.dot(center);
-            footprint.add_slab(normal, plane.distance, axis, middle - half, middle + half);
+            footprint.add_slab(plane, axis, middle - half, middle + half);
         }
         footprint
     }
 
-    /// Where a plane cuts a box.
+    /// Where a plane cuts a box, given by its corners relative to the receivers, in the world.
     #[inline(always)]
-    pub(crate) fn section(frame: &Frame, bounds: SectionBox, plane: Plane) -> Self {
-        let SectionBox { low, high } = bounds;
-        let normal = frame.local_from_world(plane.normal);
-        let mut footprint = Self::empty(frame.local_from_world((low + high) * 0.5), (high - low).length() * 0.5);
-        for (axis, low, high) in [
-            (Vec3::X, low.x, high.x),
-            (Vec3::Y, low.y, high.y),
-            (Vec3::Z, low.z, high.z),
-        ] {
-            footprint.add_slab(normal, plane.distance, frame.local_from_world(axis), low, high);
-        }
+    pub(crate) fn section(frames: &Frames<F>, low: Vector<F>, high: Vector<F>, plane: &Plane<F>) -> Self {
+        let half = F::splat(0.5);
+        let center = frames.local_from_world((low + high) * half);
+        let radius = (high - low).length_squared().sqrt() * half;
+        let mut footprint = Self::empty(center, radius);
+        let [x, y, z] = frames.axes();
+        footprint.add_slab(plane, x, low.x, high.x);
+        footprint.add_slab(plane, y, low.y, high.y);
+        footprint.add_slab(plane, z, low.z, high.z);
         footprint
     }
 
-    /// Keeps the part of a section with `cut.x >= distance`; world directions, relative to the receiver.
+    /// Keeps the part with `normal.x >= distance`; in the receivers' frames.
     #[inline(always)]
-    pub(crate) fn cut(&mut self, frame: &Frame, plane: Plane, cut: Vec3, distance: f32) {
-        let (normal, cut) = (frame.local_from_world(plane.normal), frame.local_from_world(cut));
-        self.add_half_space(cut * plane.distance - normal * distance);
+    pub(crate) fn cut(&mut self, plane: &Plane<F>, normal: Vector<F>, distance: F) {
+        self.add_half_space(normal * plane.distance - plane.normal * distance);
     }
 
-    /// Blocks of rows that the footprint may touch.
+    /// Rows that the footprint may touch in any of these lanes.
     #[inline(always)]
-    pub(crate) fn rows(&self, resolution: usize) -> std::ops::Range<usize> {
-        row_blocks(self.center, self.radius, resolution)
+    pub(crate) fn rows(&self, resolution: usize, lanes: u8) -> Range<usize> {
+        RowSpan::of_spheres(&self.center, self.radius).rows(resolution, lanes)
     }
 }
 
-/// Blocks of rows that a sphere may touch; its centre in the receiver's frame.
-#[inline(always)]
-pub(crate) fn row_blocks(center: Vec3, radius: f32, resolution: usize) -> std::ops::Range<usize> {
-    let blocks = resolution / LANES;
-    let across = (center.y * center.y + center.z * center.z).sqrt();
-    if across <= radius {
-        return 0..blocks;
+/// Rows that spheres show in, as sines of row angles.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct RowSpan<F: Floats> {
+    pub(crate) low: F,
+    pub(crate) high: F,
+    /// Where the sphere is not below the horizon.
+    seen: F::Words,
+}
+
+impl<F: Floats> RowSpan<F> {
+    /// Centres in the receivers' frames.
+    #[inline(always)]
+    pub(crate) fn of_spheres(center: &Vector<F>, radius: F) -> Self {
+        let (one, zero) = (F::splat(1.0), F::splat(0.0));
+        let across = (center.y * center.y + center.z * center.z).sqrt();
+        let apart = radius.less(across);
+        let scale = one / across;
+        let (sin, cos) = (center.y * scale, center.z * scale);
+        let delta_sin = radius * scale;
+        let delta_cos = (one - delta_sin * delta_sin).max(zero).sqrt();
+        // Row angles phi - delta and phi + delta; those with a negative cosine are below the horizon.
+        let low_above = zero.less(cos * delta_cos + sin * delta_sin);
+        let high_above = zero.less(cos * delta_cos - sin * delta_sin);
+        Self {
+            low: (low_above & apart).select(sin * delta_cos - cos * delta_sin, -one),
+            high: (high_above & apart).select(sin * delta_cos + cos * delta_sin, one),
+            seen: low_above | high_above | zero.less(cos) | !apart,
+        }
     }
-    let (sin, cos) = (center.y / across, center.z / across);
-    let delta_sin = radius / across;
-    let delta_cos = (1.0 - delta_sin * delta_sin).sqrt();
-    // Row angles phi - delta and phi + delta; those with a negative cosine are below the horizon.
-    let low_above = cos * delta_cos + sin * delta_sin > 0.0;
-    let high_above = cos * delta_cos - sin * delta_sin > 0.0;
-    if !low_above && !high_above && cos <= 0.0 {
-        return 0..0;
+
+    /// The rows of all these lanes together.
+    #[inline(always)]
+    pub(crate) fn rows(&self, resolution: usize, lanes: u8) -> Range<usize> {
+        let shown = self.seen & F::Words::from_lanes(lanes);
+        if shown.lanes() == 0 {
+            return 0..0;
+        }
+        let first = shown.select(self.low, F::splat(1.0)).min_lane();
+        let last = shown.select(self.high, F::splat(-1.0)).max_lane();
+        // Rows lie where their middles do; the slack covers rounding.
+        let row_of = |sin: f32| (sin + 1.0) * 0.5 * resolution as f32;
+        let first = (row_of(first) - 0.501).ceil().max(0.0) as usize;
+        let end = (row_of(last) + 0.501).floor().clamp(0.0, resolution as f32) as usize;
+        first..end.max(first)
     }
-    let low = if low_above {
-        sin * delta_cos - cos * delta_sin
-    } else {
-        -1.0
-    };
-    let high = if high_above {
-        sin * delta_cos + cos * delta_sin
-    } else {
-        1.0
-    };
-    let block_of = |sin: f32| (sin + 1.0) * 0.5 * blocks as f32;
-    // The rows' middles lie half a row inside; the slack covers rounding.
-    let first = (block_of(low) - 1e-3).max(0.0) as usize;
-    let end = (block_of(high) + 1e-3).ceil().clamp(0.0, blocks as f32) as usize;
-    first..end.max(first)
 }

@@ -5,9 +5,9 @@ use glam::Vec3;
 /// A right-handed orthonormal frame whose z axis is the receiver's normal.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Frame {
-    x: Vec3,
-    y: Vec3,
-    z: Vec3,
+    pub(crate) x: Vec3,
+    pub(crate) y: Vec3,
+    pub(crate) z: Vec3,
 }
 
 /// Cosine and sine of a turn about the normal that keeps raster rows off the axes of the world, along which people build:
@@ -24,20 +24,9 @@ impl Frame {
         }
     }
 
-    /// Rotates a world direction into the frame.
-    #[inline(always)]
-    pub(crate) fn local_from_world(&self, v: Vec3) -> Vec3 {
-        Vec3::new(self.x.dot(v), self.y.dot(v), self.z.dot(v))
-    }
-
     /// Rotates a direction of the frame into the world.
     #[inline(always)]
     pub(crate) fn world_from_local(&self, v: Vec3) -> Vec3 {
         self.x * v.x + self.y * v.y + self.z * v.z
-    }
-
-    #[inline(always)]
-    pub(crate) fn normal(&self) -> Vec3 {
-        self.z
     }
 }

@@ -8,14 +8,15 @@
 mod cluster;
 mod cut;
 mod environment;
-mod facet;
 mod footprint;
 mod frame;
+mod leaf;
 mod painter;
 mod raster;
 mod shader;
 mod simd;
 mod source;
+mod vector;
 
 pub use shader::{Receiver, ShadeCounters, ShadeError, Shaded, Shader};
 pub use source::{ArraySource, SceneSource, SourceError};

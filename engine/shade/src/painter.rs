@@ -1,20 +1,19 @@
-//! Draws the elements of a cut into the raster and sums what they add.
+//! Draws the elements of a cut into the raster and sums what they add, for eight receivers at a time.
 
-use crate::cluster::{Cluster, SECTION_FILL, is_aligned, is_own_surface, rectangle_of};
-use crate::cut::{Seen, Visit, Walk};
-use crate::facet::{Facet, facets};
+use crate::cluster::{Cluster, SECTION_FILL, is_aligned, is_own_surface, orthonormal_pair, rectangle_of};
+use crate::cut::{Pack, Visit, Walk};
 use crate::footprint::{Footprint, Plane};
-use crate::frame::Frame;
+use crate::leaf::{Disc, Facet, Part};
 use crate::raster::{Covered, Ink, Raster};
-use crate::shader::Receiver;
+use crate::simd::{Floats, LANES, Words};
+use crate::vector::Vector;
 use glam::Vec3;
-use pbgi_core::PointRecord;
-use pbgi_core::cluster::separate_sides;
 
 /// Above this the voxel holds two sheets, of which the receiver sees one.
 const TWO_SHEETS_FILL: f32 = 1.6;
 /// Discs are drawn this much wider than their area says, because round ones of equal area leave gaps on a surface.
 const DISC_SCALE: f32 = 1.4;
+/// Distance in radii within which a disc may be the receiver's own surface.
 const NEAR_RADII: f32 = 6.0;
 /// Width of what a disc or facet stands for, in radii, when asked whether a receiver lies on it.
 const DISC_WIDTH: f32 = 4.0;
@@ -22,245 +21,302 @@ const DISC_WIDTH: f32 = 4.0;
 const TOUCH: f32 = 1e-3;
 /// Share of covered bits from which it pays to ask whether a voxel is hidden.
 const HIDDEN_TEST_SHARE: f32 = 0.1;
-/// Share of its section that a facet's points must cover to be drawn as the section. A leaf holds few points, so the share is
-/// uncertain by a third.
-const FACET_FILL: f32 = 0.35;
 /// Share of its rectangle that a round cluster must show to be drawn opaque; thinner ones are drawn with holes.
 const OPAQUE_SHARE: f32 = 0.4;
 /// Area by which an opaque round cluster is drawn larger: a rectangle never meets its neighbours exactly, and a closed wall
 /// must not leak.
 const ROUND_SCALE: f32 = 1.2;
 
-/// Draws elements into the raster and sums what they add.
-pub(crate) struct Painter<'a> {
+/// Draws elements into the rasters and sums what they add.
+pub(crate) struct Painter<'a, F: Floats, const WORDS: usize> {
     pub(crate) walk: &'a Walk<'a>,
-    pub(crate) frame: &'a Frame,
-    pub(crate) raster: &'a mut Raster,
-    pub(crate) seen: Seen,
+    pub(crate) pack: &'a Pack<F>,
+    pub(crate) raster: &'a mut Raster<F, WORDS>,
+    /// Radiance, bit by bit.
+    pub(crate) radiance: Vector<F>,
+    /// Occlusion weight, bit by bit.
+    pub(crate) occlusion: F,
 }
 
-impl Painter<'_> {
-    /// Whether nothing of a voxel can be seen: below the horizon, or behind what is drawn already.
+impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
     #[inline(always)]
-    pub(crate) fn culls(&self, visit: &Visit) -> bool {
-        let reach = visit.half * 1.732_051 + visit.radius;
-        if self.frame.normal().dot(visit.center) < -reach {
-            return true;
+    pub(crate) fn new(walk: &'a Walk<'a>, pack: &'a Pack<F>, raster: &'a mut Raster<F, WORDS>) -> Self {
+        raster.clear();
+        Self {
+            walk,
+            pack,
+            raster,
+            radiance: Vector::splat(Vec3::ZERO),
+            occlusion: F::splat(0.0),
         }
-        let bits = self.walk.tables.bits();
-        if self.raster.covered_count() == bits {
-            return true;
-        }
-        let far = visit.center.length_squared() > 1.1 * reach * reach;
-        let local = self.frame.local_from_world(visit.center);
-        far && self.raster.covered_count() as f32 > HIDDEN_TEST_SHARE * bits as f32
-            && self.walk.simd.hides_sphere(self.raster, self.walk.tables, local, reach)
     }
 
+    /// The lanes that may see something of a voxel: it is neither below the horizon nor behind what is drawn already.
+    /// `center` is the voxel's, relative to the receivers.
     #[inline(always)]
-    pub(crate) fn draw_cluster(&mut self, cluster: &Cluster, visit: &Visit) {
-        if cluster.own_surface {
+    pub(crate) fn seen_by(&self, visit: &Visit, center: Vector<F>) -> u8 {
+        let reach = visit.half * 1.732_051 + visit.radius;
+        let below = self.pack.frames.z.dot(center).less(F::splat(-reach));
+        let bits = self.walk.tables.bits();
+        let covered = self.raster.covered_count();
+        let open = F::Words::splat(bits).greater_signed(covered);
+        let lanes = visit.lanes & open.lanes() & !below.lanes();
+        if lanes == 0 {
+            return 0;
+        }
+        let far = F::splat(1.1 * reach * reach).less(center.length_squared());
+        let worth = covered.greater_signed(F::Words::splat((HIDDEN_TEST_SHARE * bits as f32) as u32));
+        let asked = lanes & (far & worth).lanes();
+        if asked == 0 {
+            return lanes;
+        }
+        let local = self.pack.frames.local_from_world(center);
+        lanes & !F::hides_spheres(self.raster, self.walk.tables, &local, reach, asked)
+    }
+
+    /// Draws a cluster for some lanes; `center` is its voxel's, `centroid` its own, relative to the receivers.
+    #[inline(always)]
+    pub(crate) fn draw_cluster(
+        &mut self,
+        cluster: &Cluster<'_>,
+        visit: &Visit,
+        center: Vector<F>,
+        centroid: Vector<F>,
+        lanes: u8,
+    ) {
+        if !cluster.flat {
+            self.draw_round(cluster, visit, centroid, lanes);
             return;
         }
-        if cluster.flat {
-            self.draw_flat(cluster, visit)
-        } else {
-            self.draw_round(cluster, visit)
+        let lanes = lanes & !cluster.own_surface(self.pack.frames.z, centroid, center);
+        if lanes != 0 {
+            self.draw_flat(cluster, visit, center, centroid, lanes);
         }
     }
 
     /// A piece of a plane: the section of its voxel if it fills that, else the rectangle of its covariance.
-    #[inline(never)]
-    fn draw_flat(&mut self, cluster: &Cluster, visit: &Visit) {
-        let plane = Plane::through(cluster.centroid, cluster.axis, TOUCH * visit.half);
-        let toward = cluster.axis.dot(cluster.centroid) < 0.0;
+    #[inline(always)]
+    fn draw_flat(&mut self, cluster: &Cluster<'_>, visit: &Visit, center: Vector<F>, centroid: Vector<F>, lanes: u8) {
+        let frames = &self.pack.frames;
+        let axis = Vector::splat(cluster.axis);
+        let plane = Plane::through(frames, centroid, axis, TOUCH * visit.half);
         let (footprint, drawn_area) = if cluster.fill >= SECTION_FILL {
-            let section = Footprint::section(self.frame, cluster.section_box(visit), plane);
-            (section, cluster.area / cluster.fill)
+            let (of_voxel, of_points) = cluster.section_reach();
+            let (of_voxel, of_points) = (Vector::splat(of_voxel), Vector::splat(of_points));
+            let low = (center - of_voxel).max(centroid - of_points);
+            let high = (center + of_voxel).min(centroid + of_points);
+            let section = Footprint::section(frames, low, high, &plane);
+            (section, F::splat(cluster.area / cluster.fill))
         } else {
-            self.rectangle(cluster, plane)
+            let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, axis);
+            // Shrunk where the points cover less than the rectangle; it is never made larger.
+            let four = F::splat(4.0);
+            let scale = F::splat(cluster.area) / (four * a * b).max(F::splat(1e-30));
+            let scale = scale.min(F::splat(1.0)).sqrt();
+            let (a, b) = (a * scale, b * scale);
+            let sides = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
+            let rectangle = Footprint::rectangle(frames.local_from_world(centroid), &plane, sides);
+            (rectangle, four * a * b)
         };
-        let distance = cluster.distance_squared.sqrt();
-        let weight = self.weight(distance, cluster.depth);
-        let covered = self.cover(&footprint, 1.0, weight, visit);
-        if covered.bits > 0 {
-            let (even, odd) = cluster.evaluate(cluster.axis);
-            let power = |sign: f32| {
-                Vec3::new(
-                    even[1] + sign * odd[1],
-                    even[2] + sign * odd[2],
-                    even[3] + sign * odd[3],
-                )
-            };
-            let (front, back) = separate_sides(power(1.0), power(-1.0));
-            let power = if toward { front } else { back };
+        let weight = self.weight(
+            centroid,
+            #[inline(always)]
+            |direction| cluster.depth(direction),
+        );
+        let covered = self.cover(&footprint, lanes, None, weight, visit.path);
+        if let Some(covered) = covered {
+            let powers = cluster.side_powers();
             // One sheet shows all its area; of two the receiver sees the nearer.
             let area = if cluster.fill > TWO_SHEETS_FILL {
                 drawn_area
             } else {
-                cluster.area
+                F::splat(cluster.area)
             };
-            self.seen.radiance += power * (cluster.normaliser / area) * covered.light;
+            self.add_light(powers, axis, centroid, covered.light / area);
         }
-    }
-
-    #[inline(always)]
-    fn rectangle(&self, cluster: &Cluster, plane: Plane) -> (Footprint, f32) {
-        let [(u, mut a), (v, mut b)] = rectangle_of(&cluster.covariance, plane.normal);
-        // Shrunk where the points cover less than the rectangle; it is never made larger.
-        let scale = (cluster.area / (4.0 * a * b).max(1e-30)).min(1.0).sqrt();
-        a *= scale;
-        b *= scale;
-        let local = |v| self.frame.local_from_world(v);
-        let sides = [(local(u), a), (local(v), b)];
-        let footprint = Footprint::rectangle(local(cluster.centroid), local(plane.normal), plane.distance, sides);
-        (footprint, 4.0 * a * b)
     }
 
     /// A cluster without a plane: the rectangle of its covariance seen from the receiver, as wide as its projected area.
-    #[inline(never)]
-    fn draw_round(&mut self, cluster: &Cluster, visit: &Visit) {
-        let distance = cluster.distance_squared.sqrt();
-        if distance < 1e-6 * visit.half {
-            return;
-        }
-        let direction = cluster.centroid / distance;
-        let (even, odd) = cluster.evaluate(-direction);
-        // Both sides of every disc: twice the even bands.
-        let shown = (2.0 * even[0]).max(0.0) * cluster.normaliser;
+    #[inline(always)]
+    fn draw_round(&mut self, cluster: &Cluster<'_>, visit: &Visit, centroid: Vector<F>, lanes: u8) {
+        let frames = &self.pack.frames;
+        let distance = centroid.length_squared().sqrt();
+        let apart = F::splat(1e-6 * visit.half).less(distance);
+        let direction = centroid * (F::splat(1.0) / distance);
+        // Both sides of every disc.
+        let (shown, power) = cluster.toward(-direction);
         let plane = Plane {
-            normal: direction,
+            normal: frames.local_from_world(direction),
             distance,
         };
-        let [(u, mut a), (v, mut b)] = rectangle_of(&cluster.covariance, direction);
-        let whole = (4.0 * a * b).max(1e-30);
-        let share = shown / whole;
-        let mut density = 1.0;
-        if share < OPAQUE_SHARE {
-            density = share / OPAQUE_SHARE;
-        }
-        let scale = (share.clamp(OPAQUE_SHARE, 1.0) * ROUND_SCALE).sqrt();
-        a *= scale;
-        b *= scale;
-        let local = |v| self.frame.local_from_world(v);
-        let sides = [(local(u), a), (local(v), b)];
-        let footprint = Footprint::rectangle(local(cluster.centroid), local(plane.normal), distance, sides);
-        let weight = self.weight(distance, cluster.depth);
-        let covered = self.cover(&footprint, density, weight, visit);
-        if covered.bits > 0 {
-            let power = Vec3::new(even[1] + odd[1], even[2] + odd[2], even[3] + odd[3]).max(Vec3::ZERO);
-            let drawn = (4.0 * a * b * density).min(shown).max(1e-30);
-            self.seen.radiance += power * (cluster.normaliser / drawn) * covered.light;
-        }
-    }
-
-    /// A leaf that is opened: the planes its points lie on, or else their discs. Points come nearest first.
-    #[inline(never)]
-    pub(crate) fn draw_leaf(&mut self, points: &[(f32, PointRecord)], visit: &Visit, receiver: &Receiver) {
-        let Some((facets, len)) = facets(points, receiver.position) else {
-            for (_, point) in points {
-                self.draw_disc(point, receiver);
-            }
-            return;
-        };
-        let facets = &facets[..len];
-        for facet in facets {
-            let (cuts, cut_count) = facet.cuts(facets, points, receiver.position);
-            let cuts = &cuts[..cut_count];
-            // Without a neighbour to end at, a section would reach over the edge of its surface.
-            let needed = if cuts.is_empty() { SECTION_FILL } else { FACET_FILL };
-            if facet.fill(visit.center, visit.half, cuts) >= needed {
-                self.draw_facet(facet, cuts, visit, receiver);
-            } else {
-                let members = points
-                    .iter()
-                    .enumerate()
-                    .filter(|(index, _)| facet.members >> index & 1 == 1);
-                for (_, (_, point)) in members {
-                    self.draw_disc(point, receiver);
-                }
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn draw_facet(&mut self, facet: &Facet, cuts: &[(Vec3, f32)], visit: &Visit, receiver: &Receiver) {
-        let plane = Plane::through(facet.centroid, facet.normal, TOUCH * visit.half);
-        let touched =
-            is_aligned(receiver.normal, facet.normal) && plane.distance < self.walk.settings.bias * facet.radius;
-        if touched || is_own_surface(receiver.normal, facet.normal, facet.centroid, DISC_WIDTH * facet.radius) {
-            return;
-        }
-        let mut footprint = Footprint::section(self.frame, facet.section_box(visit), plane);
-        for (normal, distance) in cuts {
-            footprint.cut(self.frame, plane, *normal, *distance);
-        }
-        let weight = self.weight(facet.centroid.length(), facet.radius);
-        let covered = self.cover(&footprint, 1.0, weight, visit);
-        if covered.bits > 0 {
-            let side = usize::from(facet.normal.dot(facet.centroid) > 0.0);
-            self.seen.radiance += facet.power[side] / facet.area * covered.light;
-        }
-    }
-
-    #[inline(always)]
-    fn draw_disc(&mut self, point: &PointRecord, receiver: &Receiver) {
-        let center = Vec3::from(point.position) - receiver.position;
-        let normal = point.normal();
-        let plane = Plane::through(center, normal, TOUCH * point.radius);
-        let distance = center.length();
-        if distance < NEAR_RADII * point.radius {
-            let touched =
-                is_aligned(receiver.normal, normal) && plane.distance < self.walk.settings.bias * point.radius;
-            if touched || is_own_surface(receiver.normal, normal, center, DISC_WIDTH * point.radius) {
-                return;
-            }
-        }
-        let footprint = Footprint::disc(self.frame, center, plane, point.radius * DISC_SCALE);
-        let weight = self.weight(distance, point.radius);
-        let covered = self.walk.simd.cover(
-            self.raster,
-            self.walk.tables,
-            &footprint,
-            Ink {
-                density: 1.0,
-                weight,
-                seed: 0,
-            },
+        let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, direction);
+        let four = F::splat(4.0);
+        let tiny = F::splat(1e-30);
+        let share = shown / (four * a * b).max(tiny);
+        let density = (share * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
+        let scale = (share.clamp(OPAQUE_SHARE, 1.0) * F::splat(ROUND_SCALE)).sqrt();
+        let (a, b) = (a * scale, b * scale);
+        let sides = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
+        let footprint = Footprint::rectangle(frames.local_from_world(centroid), &plane, sides);
+        let weight = self.weight(
+            centroid,
+            #[inline(always)]
+            |direction| cluster.depth(direction),
         );
-        if covered.bits > 0 {
-            let sides = point.sides();
-            let radiance = if normal.dot(center) < 0.0 {
-                sides.front
-            } else {
-                sides.back
-            };
-            self.seen.radiance += Vec3::from(radiance) * covered.light;
-            self.seen.occlusion += weight * covered.bits as f32;
+        let lanes = lanes & apart.lanes();
+        let thin = density.less(F::splat(1.0)).lanes() & lanes != 0;
+        let covered = self.cover(&footprint, lanes, thin.then_some(density), weight, visit.path);
+        if let Some(covered) = covered {
+            let drawn = (four * a * b * density).min(shown).max(tiny);
+            let lit = covered.bits_set().select(covered.light / drawn, F::splat(0.0));
+            self.radiance = self.radiance + power * lit;
+        }
+    }
+
+    /// The parts of an opened leaf, in the order in which the walk would meet them had it gone on: by distance along the
+    /// diagonal of the octant in which the receivers stand.
+    #[inline(always)]
+    pub(crate) fn draw_parts(
+        &mut self,
+        parts: &[Part],
+        order: &mut Vec<(f32, u32)>,
+        visit: &Visit,
+        octant: u32,
+        lanes: u8,
+    ) {
+        let side = |bit: u32| if octant >> bit & 1 == 1 { 1.0f32 } else { -1.0 };
+        // Away from the receivers.
+        let diagonal = Vec3::new(side(0), side(1), side(2)) * -1.0;
+        order.clear();
+        order.extend(
+            parts
+                .iter()
+                .enumerate()
+                .map(|(index, part)| (diagonal.dot(part.center()), index as u32)),
+        );
+        order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        for (_, index) in order.iter() {
+            match &parts[*index as usize] {
+                Part::Disc(disc) => self.draw_disc(disc, lanes),
+                Part::Facet(facet) => self.draw_facet(facet, visit, lanes),
+            }
         }
     }
 
     #[inline(always)]
-    fn cover(&mut self, footprint: &Footprint, density: f32, weight: f32, visit: &Visit) -> Covered {
+    fn draw_facet(&mut self, facet: &Facet, visit: &Visit, lanes: u8) {
+        let frames = &self.pack.frames;
+        let (centroid, normal) = (self.pack.relative(facet.centroid), Vector::splat(facet.normal));
+        let plane = Plane::through(frames, centroid, normal, TOUCH * visit.half);
+        let touched =
+            is_aligned(frames.z, normal) & plane.distance.less(F::splat(self.walk.settings.bias * facet.radius));
+        let own = touched | is_own_surface(frames.z, normal, centroid, DISC_WIDTH * facet.radius);
+        let lanes = lanes & !own.lanes();
+        if lanes == 0 {
+            return;
+        }
+        let mut footprint = Footprint::section(
+            frames,
+            self.pack.relative(facet.low),
+            self.pack.relative(facet.high),
+            &plane,
+        );
+        for cut in facet.cuts() {
+            let normal = Vector::splat(cut.normal);
+            let distance = normal.dot(self.pack.relative(cut.point));
+            footprint.cut(&plane, frames.local_from_world(normal), distance);
+        }
+        let weight = self.weight(
+            centroid,
+            #[inline(always)]
+            |_| F::splat(facet.radius),
+        );
+        if let Some(covered) = self.cover(&footprint, lanes, None, weight, visit.path) {
+            self.add_light(facet.radiance, normal, centroid, covered.light);
+        }
+    }
+
+    #[inline(always)]
+    fn draw_disc(&mut self, disc: &Disc, lanes: u8) {
+        let frames = &self.pack.frames;
+        let (center, normal) = (self.pack.relative(disc.center), Vector::splat(disc.normal));
+        let plane = Plane::through(frames, center, normal, TOUCH * disc.radius);
+        let reach = NEAR_RADII * disc.radius;
+        let near = center.length_squared().less(F::splat(reach * reach));
+        let touched =
+            is_aligned(frames.z, normal) & plane.distance.less(F::splat(self.walk.settings.bias * disc.radius));
+        let own = touched | is_own_surface(frames.z, normal, center, DISC_WIDTH * disc.radius);
+        let lanes = lanes & !(near & own).lanes();
+        if lanes == 0 {
+            return;
+        }
+        let [u, v] = orthonormal_pair(normal);
+        let axes = [frames.local_from_world(u), frames.local_from_world(v)];
+        let radius = disc.radius * DISC_SCALE;
+        let footprint = Footprint::disc(frames.local_from_world(center), &plane, axes, radius);
+        let weight = self.weight(
+            center,
+            #[inline(always)]
+            |_| F::splat(disc.radius),
+        );
+        if let Some(covered) = self.cover(&footprint, lanes, None, weight, 0) {
+            self.add_light(disc.radiance, normal, center, covered.light);
+        }
+    }
+
+    /// Adds what a two-sided element at `center` shows: the first of `sides` where the receiver is on the side of `normal`.
+    #[inline(always)]
+    fn add_light(&mut self, sides: [Vec3; 2], normal: Vector<F>, center: Vector<F>, light: F) {
+        let toward = normal.dot(center).less(F::splat(0.0));
+        let (front, back) = (Vector::splat(sides[0]), Vector::splat(sides[1]));
+        let seen = Vector {
+            x: toward.select(front.x, back.x),
+            y: toward.select(front.y, back.y),
+            z: toward.select(front.z, back.z),
+        };
+        self.radiance = self.radiance + seen * light;
+    }
+
+    /// Covers a footprint; `None` if nothing of it was open.
+    #[inline(always)]
+    fn cover(
+        &mut self,
+        footprint: &Footprint<F>,
+        lanes: u8,
+        density: Option<F>,
+        weight: Option<F>,
+        seed: u64,
+    ) -> Option<Covered<F>> {
         let ink = Ink {
+            lanes,
             density,
             weight,
-            seed: visit.path,
+            seed,
         };
-        let covered = self.walk.simd.cover(self.raster, self.walk.tables, footprint, ink);
-        self.seen.occlusion += weight * covered.bits as f32;
-        covered
+        let covered = F::cover(self.raster, self.walk.tables, footprint, &ink);
+        if covered.bits_set().lanes() == 0 {
+            return None;
+        }
+        let occluded = match weight {
+            None => covered.bits,
+            Some(weight) => covered.bits * weight,
+        };
+        self.occlusion = self.occlusion + occluded;
+        Some(covered)
     }
 
-    /// How much a surface at `distance`, reaching `extent` to both sides, counts as an occluder.
+    /// How much surfaces at `center`, reaching `extent` to both sides, count as occluders; all if `None`.
     #[inline(always)]
-    fn weight(&self, distance: f32, extent: f32) -> f32 {
+    fn weight(&self, center: Vector<F>, extent: impl Fn(Vector<F>) -> F) -> Option<F> {
         let settings = self.walk.settings;
-        let within = ((settings.max_dist - distance + extent) / (2.0 * extent).max(f32::MIN_POSITIVE)).clamp(0.0, 1.0);
-        if settings.falloff > 0.0 {
-            within * (-settings.falloff * distance).exp()
-        } else {
-            within
+        if !settings.weighs_distance() {
+            return None;
         }
+        let distance = center.length_squared().sqrt();
+        let extent = extent(center * (F::splat(1.0) / distance.max(F::splat(f32::MIN_POSITIVE))));
+        let width = (extent + extent).max(F::splat(f32::MIN_POSITIVE));
+        let within = ((F::splat(settings.max_dist) - distance + extent) / width).clamp(0.0, 1.0);
+        let fade: [f32; LANES] = distance.to_array().map(|distance| (-settings.falloff * distance).exp());
+        Some(within * F::from_array(fade))
     }
 }

@@ -1,14 +1,14 @@
 //! Receivers in, irradiance and occlusion out.
 
-use crate::cut::{Scratch, Walk, gather};
+use crate::cut::{Pack, Scratch, Walk, gather};
 use crate::environment::ProbeMap;
 use crate::frame::Frame;
-use crate::raster::{Raster, RasterTables};
-use crate::simd::Simd;
+use crate::raster::{Raster, RasterTables, bent_normal, for_each_open};
+use crate::simd::{Floats, LANES, Simd, Task};
 use crate::source::{SceneSource, SourceError};
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
-use pbgi_core::{Environment, SceneInfo, SettingsError, ShadeSettings};
+use pbgi_core::{Environment, MortonCode, SceneInfo, SettingsError, ShadeSettings};
 use std::f32::consts::PI;
 
 /// Where light is gathered, world space. A receiver without a normal (or with a number that is not finite) is a hole.
@@ -77,8 +77,8 @@ pub struct Shader {
     tables: RasterTables,
     probe: Option<ProbeMap>,
     simd: Simd,
-    raster: Raster,
     scratch: Scratch,
+    order: Vec<(u64, u32)>,
     counters: ShadeCounters,
 }
 
@@ -100,8 +100,8 @@ impl Shader {
             tables: RasterTables::new(resolution),
             probe: environment.map(|environment| ProbeMap::new(environment, resolution)),
             simd: Simd::detect(),
-            raster: Raster::new(),
             scratch: Scratch::default(),
+            order: Vec::new(),
             counters: ShadeCounters::default(),
         })
     }
@@ -127,52 +127,128 @@ impl Shader {
                 results: results.len(),
             });
         }
-        for (receiver, result) in receivers.iter().zip(results) {
-            *result = self.shade(receiver, source)?;
-        }
-        Ok(())
+        results.fill(Shaded::default());
+        order_receivers(receivers, &mut self.order);
+        let group = Group {
+            walk: Walk {
+                info: &self.info,
+                settings: &self.settings,
+                tables: &self.tables,
+            },
+            probe: self.probe.as_ref(),
+            receivers,
+            order: &self.order,
+            source,
+            results,
+            scratch: &mut self.scratch,
+            counters: &mut self.counters,
+        };
+        self.simd.dispatch(group)
     }
 
     /// Work done since the start.
     pub fn counters(&self) -> ShadeCounters {
         self.counters
     }
+}
 
-    fn shade<S: SceneSource>(&mut self, receiver: &Receiver, source: &mut S) -> Result<Shaded, ShadeError> {
-        let Some(normal) = receiver.normal.try_normalize() else {
-            return Ok(Shaded::default());
-        };
-        if !receiver.position.is_finite() {
-            return Ok(Shaded::default());
+/// Receivers in the order in which they are packed: those that look the same way together, along a Z-curve. Holes are left
+/// out.
+fn order_receivers(receivers: &[Receiver], order: &mut Vec<(u64, u32)>) {
+    let usable = |receiver: &Receiver| receiver.position.is_finite() && receiver.normal.try_normalize().is_some();
+    let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+    for receiver in receivers.iter().filter(|receiver| usable(receiver)) {
+        low = low.min(receiver.position);
+        high = high.max(receiver.position);
+    }
+    let extent = (high - low).max_element().max(f32::MIN_POSITIVE);
+    let key = |receiver: &Receiver| {
+        /// Steps along an axis; more would not fit the key.
+        const STEPS: f32 = 1023.0;
+        let place = ((receiver.position - low) / extent * STEPS).as_uvec3().to_array();
+        let code = MortonCode::from_cell(place).0;
+        let axis = receiver.normal.abs().max_position() as u64;
+        let side = u64::from(receiver.normal[axis as usize] < 0.0);
+        (axis << 1 | side) << 32 | code
+    };
+    order.clear();
+    let numbered = receivers.iter().zip(0u32..).filter(|(receiver, _)| usable(receiver));
+    order.extend(numbered.map(|(receiver, index)| (key(receiver), index)));
+    order.sort_unstable();
+}
+
+/// A group of receivers to shade.
+struct Group<'a, S> {
+    walk: Walk<'a>,
+    probe: Option<&'a ProbeMap>,
+    receivers: &'a [Receiver],
+    order: &'a [(u64, u32)],
+    source: &'a mut S,
+    results: &'a mut [Shaded],
+    scratch: &'a mut Scratch,
+    counters: &'a mut ShadeCounters,
+}
+
+impl<S: SceneSource> Task for Group<'_, S> {
+    type Output = Result<(), ShadeError>;
+
+    #[inline(always)]
+    fn run<F: Floats>(self) -> Self::Output {
+        if self.walk.tables.resolution <= 32 {
+            self.shade::<F, 1>()
+        } else {
+            self.shade::<F, 2>()
         }
-        let receiver = Receiver {
-            position: receiver.position,
-            normal,
-        };
-        let frame = Frame::from_normal(normal);
-        source.begin_receiver();
-        self.raster.clear();
-        let walk = Walk {
-            info: &self.info,
-            settings: &self.settings,
-            tables: &self.tables,
-            simd: self.simd,
-        };
-        let (raster, scratch, counters) = (&mut self.raster, &mut self.scratch, &mut self.counters);
-        let seen = gather(&walk, &receiver, &frame, source, raster, scratch, counters)?;
-        self.counters.receivers += 1;
-        let mut radiance = seen.radiance;
-        if let Some(probe) = &self.probe {
-            self.raster.for_each_open(&self.tables, |row, column| {
-                radiance += probe.radiance(frame.world_from_local(self.tables.direction(row, column)));
-            });
+    }
+}
+
+impl<S: SceneSource> Group<'_, S> {
+    /// Shades pack by pack, on rasters of `WORDS` words a row.
+    #[inline(always)]
+    fn shade<F: Floats, const WORDS: usize>(self) -> Result<(), ShadeError> {
+        let tables = self.walk.tables;
+        let bit = 1.0 / tables.bits() as f32;
+        let mut raster = Raster::<F, WORDS>::new();
+        for order in self.order.chunks(LANES) {
+            let mut receivers = [Receiver::default(); LANES];
+            for (receiver, (_, index)) in receivers.iter_mut().zip(order) {
+                let given = self.receivers[*index as usize];
+                *receiver = Receiver {
+                    position: given.position,
+                    normal: given.normal.normalize(),
+                };
+            }
+            let receivers = &receivers[..order.len()];
+            let frames: [Frame; LANES] =
+                std::array::from_fn(|lane| Frame::from_normal(receivers[lane.min(receivers.len() - 1)].normal));
+            let pack = Pack::new(self.walk.info, receivers, &frames);
+            self.source.begin_pack();
+            let seen = gather(&self.walk, &pack, self.source, &mut raster, self.scratch, self.counters)?;
+            self.counters.receivers += receivers.len() as u64;
+            let (x, y, z) = (
+                seen.radiance.x.to_array(),
+                seen.radiance.y.to_array(),
+                seen.radiance.z.to_array(),
+            );
+            let occlusion = seen.occlusion.to_array();
+            for (lane, (_, index)) in order.iter().enumerate() {
+                let frame = &frames[lane];
+                let mut radiance = Vec3::new(x[lane], y[lane], z[lane]);
+                let covered = raster.covered(lane);
+                if let Some(probe) = self.probe {
+                    for_each_open(&covered, tables, |row, column| {
+                        radiance += probe.radiance(frame.world_from_local(tables.direction(row, column)));
+                    });
+                }
+                let weighed = self.walk.settings.weighs_distance();
+                let occluded = if weighed { raster.occluded(lane) } else { covered };
+                self.results[*index as usize] = Shaded {
+                    irradiance: (radiance * (PI * bit)).to_array(),
+                    occlusion: occlusion[lane] * bit,
+                    bent_normal: frame.world_from_local(bent_normal(&occluded, tables)).to_array(),
+                };
+            }
         }
-        let bit = 1.0 / self.tables.bits() as f32;
-        let bent = frame.world_from_local(self.raster.bent_normal(&self.tables));
-        Ok(Shaded {
-            irradiance: (radiance * (PI * bit)).to_array(),
-            occlusion: seen.occlusion * bit,
-            bent_normal: bent.to_array(),
-        })
+        Ok(())
     }
 }

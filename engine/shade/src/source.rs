@@ -5,20 +5,20 @@ use pbgi_core::{NodeIndex, NodeRecord, PointIndex, PointRecord};
 /// Pages of a scene, behind whatever caches there are. Slices are valid until the next call, so that a cache of a single
 /// page is enough.
 pub trait SceneSource {
-    /// The node at an index.
+    /// The node at an index, for some receivers of the pack that is being shaded, one bit each.
     ///
     /// # Errors
     /// The index is out of range, or its page cannot be had.
-    fn node(&mut self, index: NodeIndex) -> Result<&NodeRecord, SourceError>;
+    fn node(&mut self, index: NodeIndex, receivers: u8) -> Result<&NodeRecord, SourceError>;
 
-    /// The points from `first` on: at least one, at most `count`, cut where their page ends.
+    /// The points from `first` on, for some receivers: at least one, at most `count`, cut where their page ends.
     ///
     /// # Errors
     /// The range is out of bounds, or its page cannot be had.
-    fn points(&mut self, first: PointIndex, count: u32) -> Result<&[PointRecord], SourceError>;
+    fn points(&mut self, first: PointIndex, count: u32, receivers: u8) -> Result<&[PointRecord], SourceError>;
 
-    /// Another receiver begins: what is counted per receiver starts anew.
-    fn begin_receiver(&mut self) {}
+    /// Another pack of receivers begins: what is counted per receiver starts anew.
+    fn begin_pack(&mut self) {}
 }
 
 /// Why a page did not come.
@@ -44,13 +44,13 @@ pub struct ArraySource {
 
 impl SceneSource for ArraySource {
     #[inline]
-    fn node(&mut self, index: NodeIndex) -> Result<&NodeRecord, SourceError> {
+    fn node(&mut self, index: NodeIndex, _receivers: u8) -> Result<&NodeRecord, SourceError> {
         let missing = || SourceError::Corrupt(format!("node {} of {}", index.0, self.nodes.len()));
         self.nodes.get(index.0 as usize).ok_or_else(missing)
     }
 
     #[inline]
-    fn points(&mut self, first: PointIndex, count: u32) -> Result<&[PointRecord], SourceError> {
+    fn points(&mut self, first: PointIndex, count: u32, _receivers: u8) -> Result<&[PointRecord], SourceError> {
         let missing = || SourceError::Corrupt(format!("points {} + {count} of {}", first.0, self.points.len()));
         let start = first.0 as usize;
         self.points

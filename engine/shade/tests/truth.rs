@@ -87,3 +87,18 @@ fn the_scalar_twin_sees_the_same_bits() {
     };
     assert_eq!(shade(false), shade(true));
 }
+
+#[test]
+fn what_a_receiver_gets_does_not_depend_on_its_company() {
+    let truth = Truth::city();
+    let (info, mut source) = support::build(&truth.points(100_000));
+    let receivers = truth.receivers(100);
+    let mut shader = Shader::new(&info, ShadeSettings::default(), None).unwrap();
+    let mut together = vec![Shaded::default(); receivers.len()];
+    shader.shade_group(&receivers, &mut source, &mut together).unwrap();
+    let mut alone = together.clone();
+    for (receiver, shaded) in receivers.chunks(1).zip(alone.chunks_mut(1)) {
+        shader.shade_group(receiver, &mut source, shaded).unwrap();
+    }
+    assert_eq!(together, alone);
+}

@@ -1,0 +1,67 @@
+//! One bounce of light by casting rays at the mesh itself: the truth that point-based gathering is held against.
+
+use crate::scene::{MeshScene, area_vector};
+use crate::trace::Ray;
+use glam::Vec3;
+use std::f32::consts::PI;
+
+/// What a receiver gets from the surfaces of a mesh, estimated with rays.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RayCast {
+    /// Cosine-weighted share of the hemisphere that surfaces cover, 0 to 1.
+    pub occlusion: f32,
+    /// Irradiance from what those surfaces reflect of the punctual lights and emit, W/m2.
+    pub irradiance: [f32; 3],
+}
+
+impl MeshScene {
+    /// Casts `side` x `side` rays, cosine-weighted and stratified, from a receiver with unit `normal`. Every call with the
+    /// same arguments gives the same answer; `seed` chooses the rays.
+    pub fn raycast(&self, position: Vec3, normal: Vec3, side: u32, seed: u64) -> RayCast {
+        let origin = position + normal * self.ray_offset(position);
+        let (u, v) = normal.any_orthonormal_pair();
+        let mut state = seed;
+        let mut random = || {
+            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+            let mut z = state;
+            z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+            ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
+        };
+        let (mut hits, mut sum) = (0u32, Vec3::ZERO);
+        for cell in 0..side * side {
+            let share = (f32::from((cell / side) as u16) + random()) / side as f32;
+            let (sin, cos) = (2.0 * PI * ((cell % side) as f32 + random()) / side as f32).sin_cos();
+            let direction = (u * cos + v * sin) * share.sqrt() + normal * (1.0 - share).max(0.0).sqrt();
+            if let Some(radiance) = self.radiance_along(&Ray { origin, direction }) {
+                hits += 1;
+                sum += radiance;
+            }
+        }
+        let rays = (side * side).max(1) as f32;
+        RayCast {
+            occlusion: hits as f32 / rays,
+            irradiance: (sum * (PI / rays)).to_array(),
+        }
+    }
+
+    /// Radiance that comes back along a ray from the nearest surface, if there is one.
+    fn radiance_along(&self, ray: &Ray) -> Option<Vec3> {
+        let (surface, distance) = self.closest(ray)?;
+        let instance = &self.instances[surface.instance as usize];
+        let geometry = &self.geometries[instance.geometry];
+        let corners = instance.corners(geometry, surface.triangle as usize);
+        let winding = area_vector(&corners).normalize_or_zero().as_vec3();
+        let front = if instance.mirrors() { -winding } else { winding };
+        let from_front = front.dot(ray.direction) < 0.0;
+        let side = if from_front { front } else { -front };
+        let look = self.appearance(instance.geometry, surface.triangle as usize, surface.barycentric);
+        let irradiance = self.direct_one_side(ray.origin + ray.direction * distance, side, side);
+        let emission = if from_front || look.double_sided {
+            look.emission
+        } else {
+            Vec3::ZERO
+        };
+        Some(look.albedo * irradiance / PI + emission)
+    }
+}
