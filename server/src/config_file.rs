@@ -30,8 +30,6 @@ pub struct ConfigFile {
     pub log: Option<String>,
     /// `text` or `json`.
     pub log_format: Option<String>,
-    /// Where traces are sent.
-    pub otlp_endpoint: Option<String>,
     /// Who may do what.
     pub access: Access,
 }
@@ -64,7 +62,6 @@ impl ConfigFile {
                 let format = value.as_str()?;
                 ["text", "json"].contains(&format).then(|| format.to_owned())
             }),
-            otlp_endpoint: file.text("otlp_endpoint"),
             access: Access::default(),
         };
         let users = file.read("allow_users", "a list of user names and numbers", |value| {
@@ -311,7 +308,6 @@ mod tests {
             points_per_page = 1024
             log = "debug"
             log_format = "json"
-            otlp_endpoint = "http://127.0.0.1:4317"
             allow_users = ["root", 1000]
             group = 0
             [roots.shots]

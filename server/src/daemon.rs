@@ -3,6 +3,7 @@
 use crate::config::Config;
 use crate::dispatcher::Dispatcher;
 use crate::error::ServerError;
+use crate::http;
 use crate::limits;
 use crate::loader::{Loader, cache_seat};
 use crate::mounts::Mounts;
@@ -32,7 +33,9 @@ use tokio::task::JoinHandle;
 pub struct Listeners {
     jobs: UnixListener,
     queue: UnixListener,
+    http: UnixListener,
     tcp: Option<TcpListener>,
+    http_tcp: Option<TcpListener>,
     /// Names to remove in the end: those that we made.
     made: Vec<PathBuf>,
 }
@@ -62,11 +65,22 @@ impl Listeners {
         };
         let queue = bind(&queue_path, None)?;
         made.push(queue_path);
+        let http_path = config.options.http_socket();
+        let http = bind(&http_path, config.options.access.group)?;
+        made.push(http_path);
+        let http_tcp = config.options.access.http.map(bind_tcp).transpose()?;
         let tcp = match &config.options.access.tcp {
             Some(tcp) => Some(bind_tcp(tcp.address)?),
             None => None,
         };
-        Ok(Self { jobs, queue, tcp, made })
+        Ok(Self {
+            jobs,
+            queue,
+            http,
+            http_tcp,
+            tcp,
+            made,
+        })
     }
 }
 
@@ -178,6 +192,18 @@ async fn run_daemon(
         tokio::spawn(rpc::serve_jobs(listeners.jobs, dispatcher.clone(), ended.clone())),
         tokio::spawn(rpc::serve_queue(listeners.queue, dispatcher.clone(), ended.clone())),
     ];
+    servers.push(tokio::spawn(http::serve_unix(
+        listeners.http,
+        dispatcher.clone(),
+        ended.clone(),
+    )));
+    if let Some(listener) = listeners.http_tcp {
+        servers.push(tokio::spawn(http::serve_tcp(
+            listener,
+            dispatcher.clone(),
+            ended.clone(),
+        )));
+    }
     if let (Some(listener), Some(remote)) = (listeners.tcp, remote) {
         servers.push(tokio::spawn(rpc::serve_tcp(
             listener,

@@ -5,14 +5,16 @@
 
 mod clients;
 mod durable;
+mod figures;
 mod live;
 mod upkeep;
 
 pub use clients::{DaemonStatus, Submission};
+pub use figures::{JobFigures, Totals};
 
 use crate::config::Config;
 use crate::error::{JobError, JobErrorKind};
-use crate::framebuffer::TileReceivers;
+use crate::framebuffer::{Preview, TileReceivers};
 use crate::job::{JobState, JobStatus, Request};
 use crate::limits;
 use crate::live::Live;
@@ -65,6 +67,7 @@ struct State {
     seats: Vec<Option<Sitting>>,
     build_pids: HashMap<JobNo, u32>,
     number_last: u64,
+    totals: Totals,
     draining: bool,
     parked: usize,
     active: Instant,
@@ -78,6 +81,8 @@ struct Record {
     abort: watch::Sender<bool>,
     span: Span,
     shading: Option<Box<Shading>>,
+    /// What is shown of a picture that is done.
+    preview: Option<Arc<Preview>>,
     memory_peak_bytes: u64,
     cache_peak_bytes: u64,
 }
@@ -159,6 +164,7 @@ impl Dispatcher {
             seats: (0..config.options.workers).map(|_| None).collect(),
             build_pids: HashMap::new(),
             number_last: 0,
+            totals: Totals::default(),
             draining: false,
             parked: 0,
             active: Instant::now(),
@@ -267,6 +273,7 @@ impl Dispatcher {
 
     fn write(self: &Arc<Self>, state: &mut State, job: JobNo) {
         let Some(record) = state.jobs.get_mut(&job) else { return };
+        Self::keep_preview(record);
         let Some(shading) = record.shading.take() else { return };
         record.status.send_modify(|status| status.stage = "writing".into());
         let (request, abort) = (record.request.clone(), record.abort.subscribe());
@@ -355,6 +362,7 @@ impl Dispatcher {
             (status.state, status.error) = (job_state, error);
         });
         self.save(job, record);
+        *state.totals.ended.entry(job_state).or_default() += 1;
         self.retire(state, job, job_state);
     }
 
@@ -370,6 +378,7 @@ impl Dispatcher {
     /// A worker is dead and waited for.
     pub fn worker_dead(self: &Arc<Self>, seat: Seat, death: Death) {
         let mut state = self.lock();
+        state.totals.worker_deaths += 1;
         if let Some(sitting) = state.seats.get_mut(usize::from(seat.slot))
             && sitting.as_ref().is_some_and(|sitting| sitting.birth.seat == seat)
             && let Some(work) = sitting.take().and_then(|sitting| sitting.work)

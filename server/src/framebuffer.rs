@@ -7,6 +7,7 @@
 use glam::Mat4;
 use pbgi_core::limits::{GROUP_EDGE, TILE_EDGE};
 use pbgi_points::{GBuffer, Window};
+use std::collections::HashSet;
 
 /// Floats that describe a receiver: position and normal.
 const RECEIVER_FLOATS: usize = 6;
@@ -31,6 +32,19 @@ pub struct Framebuffer {
     /// Zero in holes.
     coverage: Vec<f32>,
     holes: u64,
+    /// Tiles that are done.
+    done: HashSet<u32>,
+}
+
+/// A small version of a picture, for people who wait for it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Preview {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Red, green, blue, opacity; tiles that are not done are transparent.
+    pub rgba: Vec<u8>,
 }
 
 /// The receivers of a tile, as they go to a worker.
@@ -96,7 +110,38 @@ impl Framebuffer {
             second: normal,
             coverage,
             holes: holes.len() as u64,
+            done: HashSet::new(),
         }
+    }
+
+    /// A small version of what there is: irradiance as a white surface shows it.
+    pub fn preview(&self, edge_max: u32) -> Preview {
+        let step = self.data.width.max(self.data.height).div_ceil(edge_max).max(1);
+        let (width, height) = (self.data.width / step, self.data.height / step);
+        let mut rgba = Vec::with_capacity((width * height * 4) as usize);
+        for (row, column) in (0..height).flat_map(|row| (0..width).map(move |column| (row, column))) {
+            let (x, y) = (column * step, row * step);
+            let pixel = y as usize * self.data.width as usize + x as usize;
+            let tile = self.tile_of(x, y);
+            if self.done.contains(&tile) && self.coverage[pixel] > 0.0 {
+                rgba.extend(self.first[pixel].map(shown));
+                rgba.push(255);
+            } else {
+                rgba.extend([0; 4]);
+            }
+        }
+        Preview { width, height, rgba }
+    }
+
+    /// The tile that a pixel of the data window is in.
+    fn tile_of(&self, x: u32, y: u32) -> u32 {
+        let cell = |offset: u32, start: i32, anchor: i32, origin: i64| {
+            let position = i64::from(offset) + i64::from(start) - i64::from(anchor);
+            (position.div_euclid(i64::from(TILE_EDGE)) - origin) as u32
+        };
+        let column = cell(x, self.data.x, self.display.x, self.tile_origin[0]);
+        let row = cell(y, self.data.y, self.display.y, self.tile_origin[1]);
+        row * self.tile_columns + column
     }
 
     /// Pixels.
@@ -163,6 +208,7 @@ impl Framebuffer {
 
     /// Puts the values of a tile in place, once; [`Self::check`] has seen them.
     pub fn fill(&mut self, tile: u32, values: &[u8]) {
+        self.done.insert(tile);
         let pixels: Vec<usize> = self.groups(tile).flatten().collect();
         let mut values = floats(values);
         let mut next = || values.next().unwrap_or(0.0);
@@ -229,6 +275,14 @@ impl Framebuffer {
         })
         .collect()
     }
+}
+
+/// Irradiance on white as a screen shows it.
+fn shown(irradiance: f32) -> u8 {
+    let radiance = (irradiance / std::f32::consts::PI).max(0.0);
+    // Bright parts are bent, not cut.
+    let bent = radiance / (1.0 + radiance);
+    (bent.powf(1.0 / 2.2) * 255.0).round() as u8
 }
 
 trait DivCeilSigned {
@@ -374,6 +428,18 @@ mod tests {
             assert_eq!((planes.occlusion[hole], planes.coverage[hole]), (0.0, 0.0));
         }
         assert_eq!(planes.occlusion[9 * 64 + 9], 0.5);
+    }
+
+    #[test]
+    fn preview_shows_done_tiles_only_and_stays_small() {
+        let mut frame = Framebuffer::new(gbuffer(window(-5, 3, 700, 90), window(0, 0, 700, 90)));
+        let blank = frame.preview(100);
+        assert_eq!((blank.width, blank.height), (100, 12));
+        assert!(blank.rgba.iter().all(|&byte| byte == 0));
+        shade(&mut frame);
+        let full = frame.preview(1_000);
+        assert_eq!((full.width, full.height), (700, 90));
+        assert!(full.rgba.chunks(4).all(|pixel| pixel[3] == 255));
     }
 
     #[test]

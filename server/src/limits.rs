@@ -10,6 +10,8 @@ pub const JOBS_ENDED_MAX: usize = 1_000;
 pub const JOB_ID_CHARS_MAX: usize = 128;
 /// Failed jobs whose finished tiles are kept for a retry.
 pub const FAILED_JOBS_KEPT_MAX: usize = 16;
+/// Ended jobs whose picture is still shown small, 1 MiB each at most.
+pub const PREVIEWS_MAX: usize = 8;
 /// Times that a job may run when the daemon dies, before it is taken for the reason.
 pub const DAEMON_DEATHS_MAX: u32 = 3;
 /// Labels of a job.
@@ -51,6 +53,10 @@ pub const STREAMS_MAX: u32 = 128;
 pub const REQUESTS_IN_FLIGHT_MAX: usize = 32;
 /// Connections at once, to each socket.
 pub const CONNECTIONS_MAX: usize = 256;
+/// Descriptors kept for jobs, workers and the daemon itself, whoever connects.
+pub const DESCRIPTORS_RESERVED: u64 = 40;
+/// Listeners that share the rest.
+pub const LISTENERS_MAX: u64 = 5;
 /// Streams reset before they were accepted, after which a connection is closed.
 pub const PENDING_RESETS_MAX: usize = 20;
 /// Time between HTTP/2 pings, and how long an answer may take.

@@ -384,7 +384,7 @@ mod tests {
             "overwrite was granted"
         );
         println!(
-            "RELIABILITY roots: {} escapes, {} refusals, 0 opens outside",
+            "RELIABILITY paths: {} escapes, {} refusals, 0 opens outside",
             names.len(),
             names.len()
         );
@@ -415,7 +415,7 @@ mod tests {
             }
             stop.store(true, std::sync::atomic::Ordering::Relaxed);
         });
-        println!("RELIABILITY roots: 10,000 opens against a swap, {opened} of the file, 0 of what the link names");
+        println!("RELIABILITY paths-race: 10,000 opens against a swap, {opened} of the file, 0 of what the link names");
     }
 
     #[test]

@@ -40,6 +40,13 @@ pub struct Shading {
     memory: Option<OwnedSemaphorePermit>,
 }
 
+impl Shading {
+    /// Since the first tile could go out.
+    pub fn seconds(&self) -> f64 {
+        self.started.elapsed().as_secs_f64()
+    }
+}
+
 /// What tiles took, as workers tell.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
@@ -249,7 +256,7 @@ pub async fn write(
     shading: Shading,
     abort: watch::Receiver<bool>,
 ) -> Result<Statistics, String> {
-    let seconds = shading.started.elapsed().as_secs_f64();
+    let seconds = shading.seconds();
     let mut statistics = shading_statistics(&shading, &dispatcher.cache.job_counters(job.0), seconds);
     let (memory, cache) = dispatcher.peaks(job);
     statistics.peak_memory_bytes = Some(memory as f64);
@@ -276,7 +283,7 @@ pub async fn write(
     Ok(statistics)
 }
 
-fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds: f64) -> Statistics {
+pub(crate) fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds: f64) -> Statistics {
     let info = shading.mounted.scene().info();
     let tiles = &shading.counters;
     let count = |value: u64| Some(value as f64);

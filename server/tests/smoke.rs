@@ -30,6 +30,7 @@ fn second_daemon_on_a_state_directory_is_refused_and_the_first_named() {
     assert_eq!(second.wait().unwrap().code(), Some(2));
     let holder = format!("already in use by pbgi-server with process id {}", daemon.child.id());
     assert!(line.starts_with("ERROR ") && line.contains(&holder), "{line}");
+    println!("RELIABILITY P12: the second daemon exits with 2 and names the process of the first");
     daemon.stop();
 }
 
@@ -73,6 +74,10 @@ fn second_signal_ends_at_once_and_still_cleans_up() {
     daemon.wait();
     assert!(begun.elapsed() < Duration::from_secs(10));
     assert!(segment.metadata().is_err());
+    println!(
+        "RELIABILITY P11: ended {:.0?} after two SIGTERMs, no segment left",
+        begun.elapsed()
+    );
 }
 
 #[test]
@@ -97,6 +102,7 @@ fn every_unusable_directory_is_named_on_one_line() {
     let line = first_line(&mut child);
     assert_eq!(child.wait().unwrap().code(), Some(1));
     assert_eq!(line.matches("cannot use directory").count(), 2, "{line}");
+    println!("RELIABILITY O6: 2 unusable directories, 2 lines, nothing started");
 }
 
 async fn health(daemon: &Daemon) -> ServingStatus {
@@ -119,6 +125,7 @@ async fn daemon_whose_workers_cannot_start_says_so_and_lives() {
         10,
         "five deaths for each of two slots"
     );
+    println!("RELIABILITY P7: 2 slots parked after 5 spawns each, health NOT_SERVING, the daemon answers");
     daemon.stop();
 }
 

@@ -5,8 +5,26 @@ use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+/// Whether a path is one that a shared daemon understands, `ROOT:path`, and not a file here.
+fn in_a_root(path: &Path) -> bool {
+    let root = path
+        .to_str()
+        .and_then(|text| text.split_once(':'))
+        .map(|(root, _)| root);
+    let named = |root: &str| {
+        !root.is_empty()
+            && root
+                .bytes()
+                .all(|byte| byte.is_ascii_alphanumeric() || b"_-".contains(&byte))
+    };
+    root.is_some_and(named) && fs::symlink_metadata(path).is_err()
+}
+
 /// An input file or folder that is there.
 pub(crate) fn input(path: &Path) -> Result<PathBuf, Failure> {
+    if in_a_root(path) {
+        return Ok(path.to_owned());
+    }
     path.canonicalize().map_err(|error| match error.kind() {
         io::ErrorKind::NotFound => Failure::failed(format!(
             "there is no {path:?}; check the path (the current folder is {})",
@@ -43,6 +61,9 @@ pub(crate) fn output(path: &Path, existing: Existing) -> Result<PathBuf, Failure
     let Some(name) = path.file_name() else {
         return Err(Failure::usage(format!("output {path:?} has no file name")));
     };
+    if in_a_root(path) {
+        return Ok(path.to_owned());
+    }
     let folder = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
@@ -101,6 +122,23 @@ fn here() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_in_roots_are_left_to_the_daemon() {
+        let folder = tempfile::tempdir().unwrap();
+        assert_eq!(
+            input(Path::new("scenes:a/b.pbgi")).unwrap(),
+            Path::new("scenes:a/b.pbgi")
+        );
+        assert_eq!(
+            output(Path::new("out:b.exr"), Existing::Refuse).unwrap(),
+            Path::new("out:b.exr")
+        );
+        let here = folder.path().join("odd:name");
+        fs::write(&here, "").unwrap();
+        assert_eq!(input(&here).unwrap(), here.canonicalize().unwrap());
+        assert!(input(Path::new("./none:there")).is_err());
+    }
 
     #[test]
     fn paths_become_absolute_and_links_are_resolved() {

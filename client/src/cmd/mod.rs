@@ -16,7 +16,7 @@ mod scenes;
 mod session;
 mod summary;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use failure::Failure;
 use interrupt::Interrupt;
 use std::process::ExitCode;
@@ -75,6 +75,16 @@ enum Command {
     Resume(jobs::JobNameArgs),
     /// Put a job that failed or was cancelled back in line
     Retry(jobs::JobNameArgs),
+    /// Print completions for a shell
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
+    /// Write the manual pages into a directory
+    Man {
+        /// The directory
+        directory: std::path::PathBuf,
+    },
     /// Stop the daemon once it has finished what is leased
     Shutdown(daemon::ShutdownArgs),
 }
@@ -125,6 +135,16 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
         Command::Pause(args) => jobs::pause(args, interrupt).await,
         Command::Resume(args) => jobs::resume(args, interrupt).await,
         Command::Retry(args) => jobs::retry(args, interrupt).await,
+        Command::Completions { shell } => {
+            clap_complete::generate(shell, &mut Arguments::command(), "pbgi-client", &mut std::io::stdout());
+            Ok(())
+        }
+        Command::Man { directory } => clap_mangen::generate_to(Arguments::command(), &directory).map_err(|error| {
+            Failure::failed(format!(
+                "cannot write manual pages: {error}, at {}",
+                directory.display()
+            ))
+        }),
         Command::Shutdown(args) => daemon::shutdown(args, interrupt).await,
     }
 }
@@ -132,7 +152,6 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory;
 
     #[test]
     fn the_command_line_is_consistent() {

@@ -157,6 +157,7 @@ impl Dispatcher {
             abort: watch::Sender::new(false),
             span,
             shading: None,
+            preview: None,
             memory_peak_bytes: 0,
             cache_peak_bytes: 0,
         };

@@ -55,6 +55,8 @@ impl Dispatcher {
 
     /// Takes a tile into the picture and into the table.
     pub(super) fn accept(&self, state: &mut State, job: JobNo, tile: u32, values: Vec<u8>, counters: &Counters) {
+        state.totals.tiles += 1;
+        state.totals.counters.add(counters);
         if let Some(live) = state.lives.get_mut(&job) {
             live.tiles.remove(&tile);
             live.counters.add(counters);
@@ -91,6 +93,11 @@ impl Dispatcher {
             self.table.drop_tiles(job);
         }
         state.ended.push_back(job);
+        if let Some(older) = state.ended.iter().rev().nth(limits::PREVIEWS_MAX).copied()
+            && let Some(record) = state.jobs.get_mut(&older)
+        {
+            record.preview = None;
+        }
         while state.ended.len() > limits::JOBS_ENDED_MAX {
             let Some(oldest) = state.ended.pop_front() else { return };
             state.failed.retain(|failed| *failed != oldest);
@@ -158,6 +165,7 @@ impl Dispatcher {
             status: watch::Sender::new(status),
             abort: watch::Sender::new(false),
             shading: None,
+            preview: None,
             memory_peak_bytes: 0,
             cache_peak_bytes: 0,
         };

@@ -53,7 +53,7 @@ impl Dispatcher {
         }
     }
 
-    fn pids(&self, state: &State) -> Vec<u32> {
+    pub(super) fn pids(&self, state: &State) -> Vec<u32> {
         let workers = state.seats.iter().flatten().map(|sitting| sitting.birth.pid);
         let builds = state.build_pids.values().copied();
         workers.chain(builds).chain([std::process::id()]).collect()

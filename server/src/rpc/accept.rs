@@ -1,6 +1,7 @@
 //! So many connections at once, whatever they come over.
 
 use crate::limits;
+use nix::sys::resource::{Resource, getrlimit};
 use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -45,11 +46,20 @@ impl Accept for TcpListener {
     }
 }
 
+/// Connections of one listener: what the descriptors leave, after those that jobs need.
+fn connections_max() -> usize {
+    let limit = getrlimit(Resource::RLIMIT_NOFILE).map_or(u64::MAX, |(soft, _)| soft);
+    let left = limit.saturating_sub(limits::DESCRIPTORS_RESERVED) / limits::LISTENERS_MAX;
+    limits::CONNECTIONS_MAX
+        .min(usize::try_from(left).unwrap_or(usize::MAX))
+        .max(2)
+}
+
 /// Accepts for ever. When there are too many, new ones wait in the socket's own queue.
 pub(super) fn connections<L: Accept>(listener: L) -> ReceiverStream<io::Result<Connection<L::Stream>>> {
     let (sender, receiver) = mpsc::channel(1);
     tokio::spawn(async move {
-        let places = Arc::new(Semaphore::new(limits::CONNECTIONS_MAX));
+        let places = Arc::new(Semaphore::new(connections_max()));
         let [mut pause, pause_max] = limits::ACCEPT_BACKOFF;
         loop {
             let Ok(place) = places.clone().acquire_owned().await else {

@@ -424,4 +424,27 @@ fn live_job_takes_tiles_as_they_come_and_ends_when_closed() {
     assert_eq!(effects, [Effect::Accept { job, tile: 7 }, Effect::Ended { job, end }]);
 }
 
+#[test]
+fn gap_of_an_hour_between_ticks_kills_each_worker_once_and_loses_nothing() {
+    let (mut scheduler, start) = shading(2);
+    let first = grant(&mut scheduler, seat(0, 1), start).unwrap();
+    let second = grant(&mut scheduler, seat(1, 1), start).unwrap();
+    let later = start + Duration::from_secs(3_600);
+    let kills = scheduler.on(Event::Tick, later);
+    assert_eq!(kills, [Effect::Kill(seat(0, 1)), Effect::Kill(seat(1, 1))]);
+    assert_eq!(scheduler.on(Event::Tick, later), []);
+    for slot in [0, 1] {
+        let (seat, death) = (seat(slot, 1), Death::Killed);
+        scheduler.on(Event::WorkerGone { seat, death }, later);
+    }
+    let mut again: Vec<u32> = (0..2)
+        .filter_map(|slot| grant(&mut scheduler, seat(slot, 2), later))
+        .map(|(_, tile)| tile)
+        .collect();
+    again.sort_unstable();
+    assert_eq!(again, [first.1.min(second.1), first.1.max(second.1)]);
+    assert_eq!(scheduler.on(Event::Tick, later), []);
+    println!("RELIABILITY O2: 1 h between two ticks, 2 leases expired once, both tiles handed out again");
+}
+
 mod simulation;

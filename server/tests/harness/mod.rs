@@ -130,7 +130,7 @@ impl Daemon {
         let status = self.wait();
         assert!(status.success(), "{status}: {}", self.log());
         assert!(segment.metadata().is_err(), "segment left");
-        for name in ["run/jobs.sock", "run/queue.sock", "state/segment"] {
+        for name in ["run/jobs.sock", "run/queue.sock", "run/http.sock", "state/segment"] {
             assert!(self.folder.path().join(name).symlink_metadata().is_err(), "{name} left");
         }
         assert_eq!(

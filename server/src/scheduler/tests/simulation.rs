@@ -360,6 +360,6 @@ fn no_tile_is_lost_none_counted_twice_and_every_job_ends() {
         "only {succeeded} of {ended} jobs succeeded: the simulation is too rough"
     );
     println!(
-        "P-NUMBER R9: {seeds_run} seeds, {ended} jobs, {restarts} killed daemons: no tile lost, none twice, every job ended"
+        "RELIABILITY R9: {seeds_run} seeds, {ended} jobs, {restarts} killed daemons: no tile lost, none twice, every job ended"
     );
 }
