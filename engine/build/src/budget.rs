@@ -2,9 +2,12 @@
 
 use crate::error::BuildError;
 use crate::limits::{
-    BATCH_POINTS, BATCHES_IN_FLIGHT, BLOCKS_PER_READ_MAX, MEMORY_MIN_BYTES, MEMORY_RESERVE_BYTES, SORT_MIN_BYTES,
+    BLOCKS_PER_READ_MAX, JOB_MEMORY_SHARE, JOB_POINTS_MAX, JOB_POINTS_MIN, MEMORY_MIN_BYTES, MEMORY_RESERVE_BYTES,
+    SORT_MIN_BYTES, THREADS_MAX,
 };
-use crate::sort::buffer::BYTES_PER_POINT;
+use crate::octree::construction::Gang;
+use crate::octree::subtree::nodes_max;
+use crate::sort::buffer::{KEY_BYTES, POINT_BYTES};
 use pbgi_core::limits::MORTON_BITS;
 use pbgi_core::{BuildSettings, NodeRecord, PageKind, PointRecord};
 use pbgi_store::PageLayout;
@@ -15,20 +18,26 @@ const BLOCK_BYTES: u64 = (RUN_BLOCK_RECORDS * size_of::<PointRecord>()) as u64;
 /// What each part of a build may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
-    /// Points sorted in memory at once.
+    /// Points that are sorted in memory without any run.
+    pub core_points: usize,
+    /// Points of a run: as many again are collected while one is sorted and written.
     pub run_points: usize,
     /// Runs merged at once.
     pub fan_in: usize,
+    /// Threads, and the size of their jobs.
+    pub gang: Gang,
     sort_bytes: u64,
 }
 
 impl Budget {
-    /// Splits `memory_bytes`.
+    /// Splits `memory_bytes` for a build on `threads` threads.
     ///
     /// # Errors
     /// [`BuildError::Memory`] if the settings need more.
-    pub fn new(memory_bytes: u64, settings: &BuildSettings) -> Result<Self, BuildError> {
-        let fixed = MEMORY_RESERVE_BYTES + page_buffer_bytes(settings) + queue_bytes(settings) + batch_bytes();
+    pub fn new(memory_bytes: u64, threads: usize, settings: &BuildSettings) -> Result<Self, BuildError> {
+        let fixed = MEMORY_RESERVE_BYTES + page_buffer_bytes(settings) + queue_bytes(settings);
+        let gang = gang(memory_bytes, fixed, threads, settings);
+        let fixed = fixed + job_bytes(gang, settings);
         let needed = MEMORY_MIN_BYTES.max(fixed + SORT_MIN_BYTES);
         if memory_bytes < needed {
             return Err(BuildError::Memory {
@@ -38,12 +47,14 @@ impl Budget {
         }
         let sort_bytes = memory_bytes - fixed;
         // The index of a sort key is a u32.
-        let run_points = (sort_bytes / BYTES_PER_POINT).min(u64::from(u32::MAX));
+        let points = |bytes_each: u64| usize::try_from((sort_bytes / bytes_each).min(u64::from(u32::MAX)));
         // One block is the output of an intermediate merge.
         let fan_in = (sort_bytes / BLOCK_BYTES - 1).max(2);
         Ok(Self {
-            run_points: usize::try_from(run_points).unwrap_or(usize::MAX),
+            core_points: points(POINT_BYTES + KEY_BYTES).unwrap_or(usize::MAX),
+            run_points: points(2 * POINT_BYTES + KEY_BYTES).unwrap_or(usize::MAX),
             fan_in: usize::try_from(fan_in).unwrap_or(usize::MAX),
+            gang,
             sort_bytes,
         })
     }
@@ -74,9 +85,27 @@ fn queue_bytes(settings: &BuildSettings) -> u64 {
     nodes * queues * size_of::<NodeRecord>() as u64
 }
 
-fn batch_bytes() -> u64 {
-    // The two ends hold one each, and one is grown into.
-    ((BATCHES_IN_FLIGHT + 3) * BATCH_POINTS * (size_of::<PointRecord>() + size_of::<u64>())) as u64
+/// Jobs as large as their share of the memory allows, and what is left when `fixed` bytes are taken.
+fn gang(memory_bytes: u64, fixed: u64, threads: usize, settings: &BuildSettings) -> Gang {
+    let smallest = Gang {
+        threads: threads.clamp(1, THREADS_MAX),
+        job_points: JOB_POINTS_MIN.max(settings.leaf_max as usize),
+    };
+    let left = memory_bytes.saturating_sub(fixed + SORT_MIN_BYTES);
+    let share = left.min(memory_bytes / JOB_MEMORY_SHARE);
+    let fitting = smallest.job_points as u64 * share / job_bytes(smallest, settings).max(1);
+    Gang {
+        job_points: (fitting as usize).clamp(smallest.job_points, JOB_POINTS_MAX.max(smallest.job_points)),
+        ..smallest
+    }
+}
+
+/// All jobs in flight, each with the most nodes that its points can make.
+fn job_bytes(gang: Gang, settings: &BuildSettings) -> u64 {
+    let points = 2 * gang.job_points;
+    let point_bytes = points * (size_of::<PointRecord>() + size_of::<u64>());
+    let node_bytes = nodes_max(points, settings) * size_of::<NodeRecord>();
+    (gang.jobs_in_flight() * (point_bytes + node_bytes)) as u64
 }
 
 #[cfg(test)]
@@ -85,9 +114,9 @@ mod tests {
 
     #[test]
     fn the_default_settings_fit_the_least_memory() {
-        let budget = Budget::new(MEMORY_MIN_BYTES, &BuildSettings::default()).unwrap();
-        assert!(budget.run_points > 600_000, "{budget:?}");
-        assert!(budget.fan_in > 150, "{budget:?}");
+        let budget = Budget::new(MEMORY_MIN_BYTES, 2, &BuildSettings::default()).unwrap();
+        assert!(budget.core_points > 550_000, "{budget:?}");
+        assert!(budget.fan_in > 130, "{budget:?}");
     }
 
     #[test]
@@ -98,17 +127,17 @@ mod tests {
             points_per_page: 131_072,
             ..BuildSettings::default()
         };
-        let error = Budget::new(MEMORY_MIN_BYTES, &settings).unwrap_err();
+        let error = Budget::new(MEMORY_MIN_BYTES, 2, &settings).unwrap_err();
         let BuildError::Memory { needed, .. } = error else {
             panic!("{error}")
         };
-        Budget::new(needed, &settings).unwrap();
-        assert!(Budget::new(needed - 1, &settings).is_err());
+        Budget::new(needed, 2, &settings).unwrap();
+        assert!(Budget::new(needed - 1, 2, &settings).is_err());
     }
 
     #[test]
     fn reads_stay_within_the_budget_for_any_number_of_runs() {
-        let budget = Budget::new(1 << 28, &BuildSettings::default()).unwrap();
+        let budget = Budget::new(1 << 28, 2, &BuildSettings::default()).unwrap();
         for runs in 1..=budget.fan_in {
             let bytes = (budget.blocks_per_read(runs) * runs) as u64 * BLOCK_BYTES;
             assert!(bytes <= budget.sort_bytes, "{runs} runs take {bytes}");

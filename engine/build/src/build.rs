@@ -1,21 +1,19 @@
 //! [`build()`]: reads, sorts, constructs, publishes.
 
 use crate::budget::Budget;
-use crate::content_hash::ContentHash;
 use crate::error::BuildError;
 use crate::intake::{Intake, Watcher, take_in};
-use crate::limits::{BATCH_POINTS, BATCHES_IN_FLIGHT};
 use crate::octree::construction::{Constructed, construct};
 use crate::report::{BuildProgress, BuildReport, BuildRequest, Stage};
-use crate::sort::merge::Merge;
+use crate::sort::Feed;
+use crate::sort::buffer::BufferFeed;
+use crate::sort::merge::{Merge, MergeFeed};
 use crate::sort::sorter::{SortResult, Sorter, Traffic, check_room};
-use crate::sort::{SortedBatch, SortedPoints};
 use pbgi_core::{PointRecord, PointStream, Quantizer, SceneInfo};
 use pbgi_store::limits::RECORDS_MAX;
-use pbgi_store::{OsVolume, SceneWriter, StoreError, Volume};
+use pbgi_store::{OsVolume, SceneWriter, Volume};
 use std::ops::ControlFlow;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Instant;
 
 /// What a build runs on: the real thing by default, doubles and smaller limits for tests.
@@ -29,6 +27,10 @@ pub struct BuildHost {
     pub run_points_max: usize,
     /// Runs merged at once, where fewer than the memory would hold.
     pub fan_in_max: usize,
+    /// Threads that make nodes.
+    pub threads: usize,
+    /// Points of a construction job, where fewer than the memory would hold.
+    pub job_points_max: usize,
 }
 
 impl Default for BuildHost {
@@ -38,6 +40,8 @@ impl Default for BuildHost {
             records_max: RECORDS_MAX,
             run_points_max: usize::MAX,
             fan_in_max: usize::MAX,
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            job_points_max: usize::MAX,
         }
     }
 }
@@ -66,9 +70,11 @@ pub fn build_on<S: PointStream + ?Sized>(
     observer: &mut dyn FnMut(BuildProgress) -> ControlFlow<()>,
 ) -> Result<BuildReport, BuildError<S::Error>> {
     request.settings.validate()?;
-    let mut budget = Budget::new(request.memory_bytes, &request.settings).map_err(BuildError::widen)?;
+    let mut budget = Budget::new(request.memory_bytes, host.threads, &request.settings).map_err(BuildError::widen)?;
     budget.run_points = budget.run_points.min(host.run_points_max).max(1);
+    budget.core_points = budget.core_points.min(host.run_points_max).max(1);
     budget.fan_in = budget.fan_in.min(host.fan_in_max).max(2);
+    budget.gang.job_points = budget.gang.job_points.min(host.job_points_max).max(1);
     let mut watcher = Watcher(observer);
     // First of all, so that an output that cannot be written is known before the points are sorted.
     let writer = SceneWriter::create(&host.volume, &request.output, request.overwrite, &request.settings)?;
@@ -101,31 +107,33 @@ impl Job<'_> {
         check_room(writer.free_bytes()?, point_bytes, writer.target())?;
         let mut traffic = Traffic::default();
         let mut constructed = Constructed::default();
-        let mut hash = ContentHash::default();
         let mut building = Instant::now();
         if let Some(quantizer) = self.intake.quantizer {
             let sorted;
             (sorted, traffic) = self.merge_down(sorter, &quantizer)?;
             building = Instant::now();
-            (constructed, hash) = match sorted {
+            constructed = match sorted {
                 SortResult::Memory(buffer) => {
                     self.watcher.tell(Stage::Sorting, 0, Some(points))?;
-                    let mut sorted = buffer.sorted(&quantizer);
+                    let order = buffer.sorted(&quantizer, self.budget.gang.threads);
                     self.intake.seconds.sorting += building.elapsed().as_secs_f64();
                     building = Instant::now();
-                    self.construct(&mut sorted, &mut writer, &quantizer)?
+                    self.construct(&mut BufferFeed::new(buffer, order), &mut writer, &quantizer)?
                 }
                 SortResult::Runs(runs, _scratch) => {
                     let blocks = self.budget.blocks_per_read(runs.len());
-                    let mut merge = Merge::new(runs, blocks, quantizer)?;
-                    self.construct(&mut merge, &mut writer, &quantizer)?
+                    let merge = Merge::new(runs, blocks, quantizer)?;
+                    self.construct(&mut MergeFeed::new(merge), &mut writer, &quantizer)?
                 }
             };
         }
         debug_assert_eq!(writer.point_count(), points, "every point has been written");
-        let info = self.describe(&constructed, hash, writer.node_slots());
+        let info = self.describe(&constructed, writer.node_slots());
         self.watcher.tell(Stage::Building, points, Some(points))?;
+        let syncing = Instant::now();
         let scene_bytes = writer.finish(&info)?;
+        constructed.busy.syncing = syncing.elapsed().as_secs_f64();
+        constructed.busy.spilling = traffic.spill_seconds;
         let mut stages = self.intake.seconds;
         stages.building = building.elapsed().as_secs_f64();
         Ok(BuildReport {
@@ -133,105 +141,55 @@ impl Job<'_> {
             sort_seconds: stages.reading + stages.sorting + stages.merging,
             build_seconds: stages.building,
             stages,
+            busy: constructed.busy,
+            queue_peak_bytes: constructed.placed.queue_peak_bytes,
             bytes_read: traffic.bytes_read,
             bytes_written: traffic.bytes_written + scene_bytes,
             runs: traffic.runs,
             radiance_clamped: self.intake.tally.radiance_clamped,
-            harmonics_clamped: constructed.harmonics_clamped,
-            overflow_points: constructed.overflow_points,
+            harmonics_clamped: constructed.placed.tallies.harmonics_clamped,
+            overflow_points: constructed.placed.tallies.overflow_points,
         })
     }
 
     /// Until everything is in memory or in few enough runs.
-    fn merge_down(&mut self, mut sorter: Sorter, quantizer: &Quantizer) -> Result<(SortResult, Traffic), BuildError> {
+    fn merge_down(&mut self, sorter: Sorter, quantizer: &Quantizer) -> Result<(SortResult, Traffic), BuildError> {
         let (points, watcher) = (self.intake.tally.points, &mut self.watcher);
-        if sorter.has_runs() {
-            let started = Instant::now();
-            sorter.spill(quantizer, None, &mut |_| {
-                watcher.tell(Stage::Sorting, points, Some(points))
-            })?;
-            self.intake.seconds.sorting += started.elapsed().as_secs_f64();
-        }
+        watcher.tell(Stage::Sorting, points, Some(points))?;
         let started = Instant::now();
         let result = sorter.finish(quantizer, &mut |done| watcher.tell(Stage::Merging, done, None))?;
         self.intake.seconds.merging += started.elapsed().as_secs_f64();
         Ok(result)
     }
 
-    /// Construction on this thread, the last merge on another.
     fn construct(
         &mut self,
-        points: &mut (dyn SortedPoints + Send),
+        feed: &mut (dyn Feed + Send),
         writer: &mut SceneWriter,
         quantizer: &Quantizer,
-    ) -> Result<(Constructed, ContentHash), BuildError> {
-        let (to_construction, from_sort) = sync_channel(BATCHES_IN_FLIGHT);
-        let (to_sort, from_construction) = sync_channel(BATCHES_IN_FLIGHT);
+    ) -> Result<Constructed, BuildError> {
         let total = Some(self.intake.tally.points);
-        let (settings, records_max, watcher) = (&self.request.settings, self.records_max, &mut self.watcher);
-        std::thread::scope(|scope| {
-            let producer = std::thread::Builder::new()
-                .name("pbgi-merge".to_owned())
-                .spawn_scoped(scope, move || produce(points, &to_construction, &from_construction))
-                .map_err(BuildError::Thread)?;
-            let mut done = 0;
-            // Owns its end of the channels: when construction fails, they close, and the producer ends.
-            let mut source = move |emptied: SortedBatch| {
-                watcher.tell(Stage::Building, done, total)?;
-                // A full channel means that there are empty batches enough.
-                let _ = to_sort.try_send(emptied);
-                let batch: SortedBatch = from_sort.recv().unwrap_or(Ok(SortedBatch::default()))?;
-                done += batch.codes.len() as u64;
-                Ok(batch)
-            };
-            let constructed = construct(&mut source, writer, quantizer, settings, records_max);
-            drop(source);
-            match producer.join() {
-                Ok(hash) => Ok((constructed?, hash)),
-                Err(panic) => std::panic::resume_unwind(panic),
-            }
-        })
+        let watcher = &mut self.watcher;
+        let mut tell = |done| watcher.tell(Stage::Building, done, total);
+        let (settings, gang) = (&self.request.settings, self.budget.gang);
+        construct(feed, writer, quantizer, settings, gang, self.records_max, &mut tell)
     }
 
-    fn describe(&self, constructed: &Constructed, hash: ContentHash, node_slots: u64) -> SceneInfo {
+    fn describe(&self, constructed: &Constructed, node_slots: u64) -> SceneInfo {
         let Intake { tally, quantizer, .. } = &self.intake;
         // A box that was declared for no points at all makes no lattice.
         let quantizer = quantizer.filter(|_| tally.points > 0);
         let settings = self.request.settings;
         SceneInfo {
-            build_id: hash.finish(tally.points, quantizer.as_ref(), &settings),
+            build_id: constructed.hash.clone().finish(tally.points, quantizer.as_ref(), &settings),
             point_count: tally.points,
-            node_count: constructed.node_count,
+            node_count: constructed.placed.tallies.nodes,
             node_slots,
-            root: constructed.root,
+            root: constructed.placed.root,
             bounds: quantizer.map(|_| tally.bounds),
             quantizer,
             radius_max: tally.radius_max,
             settings,
-        }
-    }
-}
-
-/// Sends all points in order, and hashes them on the way. Ends early when nobody listens any more.
-fn produce(
-    points: &mut dyn SortedPoints,
-    to_construction: &SyncSender<Result<SortedBatch, StoreError>>,
-    from_construction: &Receiver<SortedBatch>,
-) -> ContentHash {
-    let mut hash = ContentHash::default();
-    loop {
-        let mut batch = from_construction.try_recv().unwrap_or_default();
-        if batch.points.capacity() < BATCH_POINTS {
-            batch = SortedBatch::with_room();
-        }
-        let sorted = points.next_sorted(&mut batch);
-        if batch.points.is_empty() && sorted.is_ok() {
-            return hash;
-        }
-        batch.points.iter().for_each(|point| hash.add(point));
-        let failed = sorted.is_err();
-        if to_construction.send(sorted.map(|()| batch)).is_err() || failed {
-            return hash;
         }
     }
 }

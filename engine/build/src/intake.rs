@@ -1,11 +1,16 @@
-//! The first stage: every point is taken from the input, looked at once, and given to the sorter.
+//! The first stage: every point is taken from the input, looked at once, and given to the sorter. Decoding and looking
+//! are done by several threads; the order is that of the input.
 
 use crate::error::BuildError;
 use crate::report::{BuildProgress, Stage, StageSeconds};
 use crate::sort::sorter::Sorter;
 use pbgi_core::limits::HALF_MAX;
-use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream, Quantizer};
+use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream, Quantizer, Undecoded};
+use std::collections::VecDeque;
 use std::ops::ControlFlow;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Mutex, PoisonError};
+use std::thread::Builder;
 use std::time::Instant;
 
 /// Carries progress to the observer, and its wish to stop back.
@@ -50,6 +55,17 @@ impl<T> Misfits<T> {
         });
         entry.count += 1;
     }
+
+    /// Adds those of a later part of the input, which starts at point `offset`.
+    fn merge(misfits: &mut Option<Self>, later: Option<Self>, offset: u64) {
+        let Some(later) = later else { return };
+        let entry = misfits.get_or_insert(Self {
+            count: 0,
+            first: later.first + offset,
+            ..later
+        });
+        entry.count += later.count;
+    }
 }
 
 impl Default for Tally {
@@ -84,6 +100,16 @@ impl Tally {
         let mut radiance = point.front_radiance.iter().chain(&point.back_radiance);
         self.radiance_clamped += u64::from(radiance.any(|value| value.to_f32() >= HALF_MAX));
         true
+    }
+
+    /// Adds the tally of the points that follow.
+    fn merge(&mut self, later: &Self) {
+        Misfits::merge(&mut self.invalid, later.invalid, self.points);
+        Misfits::merge(&mut self.outside, later.outside, self.points);
+        self.points += later.points;
+        self.bounds.merge(&later.bounds);
+        self.radius_max = self.radius_max.max(later.radius_max);
+        self.radiance_clamped += later.radiance_clamped;
     }
 
     fn check(&self) -> Result<(), BuildError> {
@@ -123,13 +149,14 @@ pub(crate) fn take_in<S: PointStream + ?Sized>(
     watcher: &mut Watcher<'_>,
 ) -> Result<Intake, BuildError<S::Error>> {
     let declared = stream.bounds();
+    sorter.expect(stream.len_hint());
     if let Some(Bounds { min, max }) = declared.filter(|bounds| !bounds.is_empty() && lattice(bounds).is_none()) {
         return Err(BuildError::Bounds { min, max });
     }
     let mut pass = Pass {
         declared,
         quantizer: declared.as_ref().and_then(lattice),
-        keeps: true,
+        keeps: declared.is_some() || sorter.fits_core(),
         tally: Tally::default(),
         seconds: StageSeconds::default(),
         records_max,
@@ -169,6 +196,38 @@ struct Pass {
     records_max: u64,
 }
 
+/// A batch that has been decoded and looked at.
+struct Looked {
+    points: Vec<PointRecord>,
+    tally: Tally,
+}
+
+type Answer<E> = Result<Looked, E>;
+type Question<E> = (Undecoded<E>, SyncSender<Answer<E>>);
+
+/// Decodes and looks until there is nothing more to decode.
+fn look<E>(questions: &Mutex<Receiver<Question<E>>>, declared: Option<&Bounds>) {
+    loop {
+        let next = questions.lock().unwrap_or_else(PoisonError::into_inner).recv();
+        let Ok((decode, answer)) = next else { return };
+        let mut points = Vec::new();
+        let looked = decode(&mut points).map(|()| {
+            let mut tally = Tally::default();
+            let mut usable = true;
+            for point in &points {
+                usable &= tally.add(point, declared);
+            }
+            if !usable {
+                // The build ends in an error: no need to keep the good ones among them.
+                points.clear();
+            }
+            Looked { points, tally }
+        });
+        // Nobody waits for it when the build has failed.
+        let _ = answer.send(looked);
+    }
+}
+
 impl Pass {
     fn run<S: PointStream + ?Sized>(
         &mut self,
@@ -177,44 +236,75 @@ impl Pass {
         watcher: &mut Watcher<'_>,
     ) -> Result<(), BuildError<S::Error>> {
         let total = stream.len_hint();
-        let mut batch = Vec::new();
-        loop {
-            let started = Instant::now();
-            batch.clear();
-            let more = stream.next_batch(&mut batch).map_err(BuildError::Input)?;
-            self.take(&batch, total, sorter, watcher).map_err(BuildError::widen)?;
-            self.seconds.reading += started.elapsed().as_secs_f64();
-            let told = watcher.tell(Stage::Reading, self.tally.points, total);
-            told.map_err(BuildError::widen)?;
-            if !more {
-                return self.tally.check().map_err(BuildError::widen);
+        let threads = sorter.threads();
+        let declared = self.declared;
+        let (ask, questions) = sync_channel(threads);
+        let questions = Mutex::new(questions);
+        std::thread::scope(|scope| {
+            for _ in 0..threads {
+                let questions = &questions;
+                let started = Builder::new()
+                    .name("pbgi-decode".to_owned())
+                    .spawn_scoped(scope, move || look(questions, declared.as_ref()));
+                started.map_err(BuildError::Thread)?;
             }
-        }
+            // Moved in, so that the threads end when this does.
+            let ask: SyncSender<Question<S::Error>> = ask;
+            let mut asked = VecDeque::new();
+            let mut end: Option<Result<(), S::Error>> = None;
+            loop {
+                let started = Instant::now();
+                while end.is_none() && asked.len() < 2 * threads {
+                    match stream.next_undecoded() {
+                        Ok(Some(undecoded)) => {
+                            let (answer, looked) = sync_channel(1);
+                            asked.push_back(looked);
+                            // Fails only when every thread has panicked, which the scope tells.
+                            let _ = ask.send((undecoded, answer));
+                        }
+                        Ok(None) => end = Some(Ok(())),
+                        Err(error) => end = Some(Err(error)),
+                    }
+                }
+                // What was read before the end is told first.
+                let Some(next) = asked.pop_front() else {
+                    end.unwrap_or(Ok(())).map_err(BuildError::Input)?;
+                    return self.tally.check().map_err(BuildError::widen);
+                };
+                if let Ok(looked) = next.recv() {
+                    let looked = looked.map_err(BuildError::Input)?;
+                    self.take(&looked, total, sorter, watcher).map_err(BuildError::widen)?;
+                }
+                self.seconds.reading += started.elapsed().as_secs_f64();
+                let told = watcher.tell(Stage::Reading, self.tally.points, total);
+                told.map_err(BuildError::widen)?;
+            }
+        })
     }
 
     fn take(
         &mut self,
-        batch: &[PointRecord],
+        looked: &Looked,
         total: Option<u64>,
         sorter: &mut Sorter,
         watcher: &mut Watcher<'_>,
     ) -> Result<(), BuildError> {
-        for point in batch {
-            if self.tally.points == self.records_max {
-                return Err(BuildError::Limit {
-                    what: "points",
-                    max: self.records_max,
-                });
-            }
-            if !self.tally.add(point, self.declared.as_ref()) || !self.keeps {
+        self.tally.merge(&looked.tally);
+        if self.tally.points > self.records_max {
+            return Err(BuildError::Limit {
+                what: "points",
+                max: self.records_max,
+            });
+        }
+        let mut points = looked.points.as_slice();
+        while self.keeps && !points.is_empty() {
+            if sorter.buffer().room() == 0 {
+                self.make_room(total, sorter, watcher)?;
                 continue;
             }
-            if sorter.buffer().is_full() {
-                self.make_room(total, sorter, watcher)?;
-            }
-            if self.keeps {
-                sorter.buffer().push(*point);
-            }
+            let (head, tail) = points.split_at(sorter.buffer().room().min(points.len()));
+            sorter.buffer().extend(head);
+            points = tail;
         }
         Ok(())
     }
@@ -232,8 +322,8 @@ impl Pass {
             return Ok(());
         };
         let started = Instant::now();
-        let points = self.tally.points;
-        sorter.spill(quantizer, total, &mut |_| watcher.tell(Stage::Sorting, points, total))?;
+        watcher.tell(Stage::Sorting, self.tally.points, total)?;
+        sorter.spill(quantizer)?;
         let seconds = started.elapsed().as_secs_f64();
         self.seconds.sorting += seconds;
         // The caller's clock runs on.

@@ -9,11 +9,21 @@ pub const MEMORY_RESERVE_BYTES: u64 = 16 << 20;
 /// Least memory left for points once everything else has its share.
 pub const SORT_MIN_BYTES: u64 = 8 << 20;
 
-/// Points handed from one stage to the next at once: 320 KiB with their codes, which stays in a core's own cache.
+/// Points between two looks at whether the build goes on.
 pub const BATCH_POINTS: usize = 8192;
 
-/// Batches on their way between the sorting and the constructing thread.
-pub const BATCHES_IN_FLIGHT: usize = 4;
+/// Points of a construction job: 2.6 MB with codes and a usual number of nodes, so that handing over costs nothing and
+/// the jobs in flight fit the caches.
+pub const JOB_POINTS_MAX: usize = 1 << 14;
+
+/// Points of a job where there is little memory.
+pub const JOB_POINTS_MIN: usize = 256;
+
+/// Jobs in flight get this fraction of the memory, 1 / 8, counted for clouds that make the most nodes.
+pub const JOB_MEMORY_SHARE: u64 = 8;
+
+/// Threads of one build: more would wait for the one that merges and the one that writes.
+pub const THREADS_MAX: usize = 32;
 
 /// Most blocks of a run read at once: 4 MiB, beyond which a disk gets no faster.
 pub const BLOCKS_PER_READ_MAX: usize = 16;

@@ -1,5 +1,6 @@
 //! What a build is asked for, what it says on the way, and what it reports at the end.
 
+use crate::octree::construction::BusySeconds;
 use pbgi_core::{BuildSettings, SceneInfo};
 use pbgi_store::Overwrite;
 use std::path::PathBuf;
@@ -79,6 +80,10 @@ pub struct BuildReport {
     pub build_seconds: f64,
     /// The same in detail.
     pub stages: StageSeconds,
+    /// Where the threads of the last stage spent their time.
+    pub busy: BusySeconds,
+    /// Most bytes that all write-out queues held at once.
+    pub queue_peak_bytes: u64,
     /// Bytes read back from scratch; the input counts its own.
     pub bytes_read: u64,
     /// Bytes written to scratch and to the scene.

@@ -27,6 +27,7 @@ pub mod temporary;
 #[cfg(any(test, feature = "testsuite"))]
 pub mod testsuite;
 pub mod volume;
+mod write_behind;
 
 pub use atomic_file::{AtomicFile, Overwrite};
 pub use data_file::DataFile;

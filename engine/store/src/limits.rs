@@ -14,6 +14,10 @@ pub const CHECKSUM_BYTES: u64 = 4;
 /// Bytes a page file gathers before it writes, unless one page is larger.
 pub const WRITE_BUFFER_BYTES: usize = 1 << 20;
 
+/// Bytes written to a page file after which it is synced in the background: long enough that a disk works at its full
+/// rate, short enough that little is left at the end.
+pub const SYNC_BEHIND_BYTES: u64 = 32 << 20;
+
 /// Records in a block of a run: 256 KiB, large enough to read at the speed of the disk, small enough that 64 MB merge
 /// 190 runs at once.
 pub const RUN_BLOCK_RECORDS: usize = 8192;

@@ -5,6 +5,7 @@ use crate::error::StoreError;
 use crate::limits::{RECORDS_MAX, WRITE_BUFFER_BYTES};
 use crate::page_header::{PageHeader, PageLayout};
 use crate::volume::Volume;
+use crate::write_behind::WriteBehind;
 use pbgi_core::BuildId;
 use std::path::Path;
 use std::sync::Arc;
@@ -12,7 +13,8 @@ use std::sync::Arc;
 /// Writes `[header | pages | checksums]` front to back; the header last, so that an unfinished file never opens.
 /// Memory: one mebibyte or one page, and four bytes a page.
 pub struct PageFileWriter {
-    file: DataFile,
+    file: Arc<DataFile>,
+    behind: WriteBehind,
     layout: PageLayout,
     /// Whole pages and the one that is being filled.
     buffer: Vec<u8>,
@@ -31,8 +33,10 @@ impl PageFileWriter {
     pub fn create(volume: &Arc<dyn Volume>, path: &Path, layout: PageLayout) -> Result<Self, StoreError> {
         let page_bytes = layout.page_bytes();
         let buffer_bytes = (WRITE_BUFFER_BYTES / page_bytes).max(1) * page_bytes;
+        let file = Arc::new(DataFile::create_new(volume, path)?);
         Ok(Self {
-            file: DataFile::create_new(volume, path)?,
+            behind: WriteBehind::new(&file),
+            file,
             layout,
             buffer: Vec::with_capacity(buffer_bytes),
             buffer_bytes,
@@ -128,7 +132,11 @@ impl PageFileWriter {
     fn write_pages(&mut self) -> Result<(), StoreError> {
         let pages = self.buffer.chunks_exact(self.layout.page_bytes());
         self.checksums.extend(pages.map(crc32c::crc32c));
-        self.file.write_at(self.offset, &self.buffer)?;
+        self.file
+            .write_at(self.offset, &self.buffer)
+            // A file that a sync has abandoned: the sync's own error says more.
+            .or_else(|error| self.behind.settle().and(Err(error)))?;
+        self.behind.wrote(self.buffer.len() as u64)?;
         self.offset += self.buffer.len() as u64;
         self.buffer.clear();
         Ok(())
@@ -144,6 +152,7 @@ impl PageFileWriter {
         if !self.buffer.is_empty() {
             self.write_pages()?;
         }
+        self.behind.settle()?;
         let table: &[u8] = bytemuck::cast_slice(&self.checksums);
         if !table.is_empty() {
             self.file.write_at(self.offset, table)?;

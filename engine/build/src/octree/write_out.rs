@@ -76,6 +76,12 @@ impl WriteOutQueue {
         self.levels.iter().flat_map(QueueLevel::groups)
     }
 
+    /// Bytes of the nodes in it.
+    pub fn bytes(&self) -> u64 {
+        let nodes: usize = self.levels.iter().map(|level| level.nodes.len()).sum();
+        (nodes * size_of::<NodeRecord>()) as u64
+    }
+
     /// Forgets the nodes, keeps the memory.
     pub fn clear(&mut self) {
         for level in &mut self.levels {

@@ -1,7 +1,7 @@
 //! [`Merge`]: many sorted runs read as one, through a tree of losers (Knuth, volume 3, section 5.4.1).
 
-use crate::limits::BATCH_POINTS;
-use crate::sort::{SortedBatch, SortedPoints};
+use crate::error::BuildError;
+use crate::sort::{Feed, Piece};
 use pbgi_core::{PointRecord, Quantizer};
 use pbgi_store::{Run, RunReader, StoreError};
 
@@ -131,14 +131,47 @@ impl Merge {
     }
 }
 
-impl SortedPoints for Merge {
-    fn next_sorted(&mut self, batch: &mut SortedBatch) -> Result<(), StoreError> {
-        batch.clear();
-        while batch.codes.len() < BATCH_POINTS
-            && let Some((code, point)) = self.next_point()?
-        {
-            batch.push(code, point);
+/// Feeds what a merge gives.
+pub struct MergeFeed {
+    merge: Merge,
+    codes: Vec<u64>,
+    points: Vec<PointRecord>,
+    ended: bool,
+}
+
+impl MergeFeed {
+    /// Feeds everything that `merge` has.
+    pub fn new(merge: Merge) -> Self {
+        Self {
+            merge,
+            codes: Vec::new(),
+            points: Vec::new(),
+            ended: false,
         }
-        Ok(())
+    }
+}
+
+impl Feed for MergeFeed {
+    fn codes(&mut self, count: usize) -> Result<&[u64], BuildError> {
+        while self.codes.len() < count && !self.ended {
+            match self.merge.next_point()? {
+                Some((code, point)) => {
+                    self.codes.push(code);
+                    self.points.push(point);
+                }
+                None => self.ended = true,
+            }
+        }
+        Ok(&self.codes)
+    }
+
+    fn take(&mut self, count: usize) -> Piece {
+        // What is left is less than a job, and stays in front.
+        let codes_left = self.codes.split_off(count);
+        let points_left = self.points.split_off(count);
+        Piece::Points(
+            std::mem::replace(&mut self.codes, codes_left),
+            std::mem::replace(&mut self.points, points_left),
+        )
     }
 }

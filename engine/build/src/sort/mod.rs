@@ -5,46 +5,36 @@ pub mod buffer;
 pub mod merge;
 pub mod sorter;
 
-use crate::limits::BATCH_POINTS;
+use crate::error::BuildError;
+use crate::sort::buffer::Stretch;
 use pbgi_core::PointRecord;
-use pbgi_store::StoreError;
 
-/// Some consecutive sorted points, each with its Morton code.
-#[derive(Debug, Default)]
-pub struct SortedBatch {
-    /// Morton codes, never falling.
-    pub codes: Vec<u64>,
-    /// The points.
-    pub points: Vec<PointRecord>,
-}
-
-impl SortedBatch {
-    /// Room for a whole batch.
-    pub fn with_room() -> Self {
-        Self {
-            codes: Vec::with_capacity(BATCH_POINTS),
-            points: Vec::with_capacity(BATCH_POINTS),
-        }
-    }
-
-    /// Forgets the points, keeps the room.
-    pub fn clear(&mut self) {
-        self.codes.clear();
-        self.points.clear();
-    }
-
-    #[inline]
-    pub(crate) fn push(&mut self, code: u64, point: PointRecord) {
-        self.codes.push(code);
-        self.points.push(point);
-    }
-}
-
-/// Sorted points, read once from front to back.
-pub trait SortedPoints {
-    /// Replaces the content of `batch` by the next [`BATCH_POINTS`] points; fewer at the end, then none.
+/// Sorted points, read once from front to back: codes are seen before their points are taken.
+pub trait Feed {
+    /// The next codes, at least `count` of them, fewer only at the end.
     ///
     /// # Errors
     /// Scratch cannot be read.
-    fn next_sorted(&mut self, batch: &mut SortedBatch) -> Result<(), StoreError>;
+    fn codes(&mut self, count: usize) -> Result<&[u64], BuildError>;
+
+    /// Takes the next `count` points, which must have been seen.
+    fn take(&mut self, count: usize) -> Piece;
+}
+
+/// Some consecutive sorted points.
+pub enum Piece {
+    /// Where they are in memory; fetching them is the dear part, and is done by whoever needs them.
+    Stretch(Stretch),
+    /// Morton codes, and the points that they belong to.
+    Points(Vec<u64>, Vec<PointRecord>),
+}
+
+impl Piece {
+    /// Replaces the content of `codes` and `points` by these.
+    pub fn read(self, codes: &mut Vec<u64>, points: &mut Vec<PointRecord>) {
+        match self {
+            Self::Stretch(stretch) => stretch.read(codes, points),
+            Self::Points(its_codes, its_points) => (*codes, *points) = (its_codes, its_points),
+        }
+    }
 }

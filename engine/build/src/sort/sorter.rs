@@ -9,21 +9,56 @@ use pbgi_core::{PointRecord, Quantizer};
 use pbgi_store::{Run, RunWriter, ScratchDir, StoreError, Volume};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::thread::{Builder, JoinHandle};
+use std::time::Instant;
 
-/// Collects points, spills sorted runs.
+/// Collects points, spills sorted runs: one is sorted and written while the next is collected.
 pub struct Sorter {
     buffer: PointBuffer,
+    spilling: Spilling,
     runs: Vec<Run>,
     // Dropped after the runs in it.
-    scratch: Option<ScratchDir>,
+    scratch: Option<Arc<ScratchDir>>,
     volume: Arc<dyn Volume>,
     scratch_dir: PathBuf,
     budget: Budget,
+    /// Points that the input says it has.
+    expected: u64,
     traffic: Traffic,
 }
 
+/// The run that is being made. Dropping it waits for its end, so that nothing is written to scratch any more.
+#[derive(Default)]
+struct Spilling(Option<JoinHandle<Result<Spilled, StoreError>>>);
+
+struct Spilled {
+    run: Run,
+    /// Emptied.
+    buffer: PointBuffer,
+    seconds: f64,
+}
+
+impl Spilling {
+    fn wait(&mut self) -> Result<Option<Spilled>, StoreError> {
+        match self.0.take().map(JoinHandle::join) {
+            None => Ok(None),
+            Some(Ok(spilled)) => spilled.map(Some),
+            Some(Err(panic)) => std::panic::resume_unwind(panic),
+        }
+    }
+}
+
+impl Drop for Spilling {
+    fn drop(&mut self) {
+        if let Some(thread) = self.0.take() {
+            // Whoever drops it has an error of its own to tell.
+            let _ = thread.join();
+        }
+    }
+}
+
 /// What went to scratch and came back.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Traffic {
     /// Runs written.
     pub runs: u64,
@@ -31,6 +66,8 @@ pub struct Traffic {
     pub bytes_written: u64,
     /// Bytes read, those of the last merge included.
     pub bytes_read: u64,
+    /// Time spent sorting runs and writing them.
+    pub spill_seconds: f64,
 }
 
 /// All points, ready to be read in order.
@@ -38,7 +75,7 @@ pub enum SortResult {
     /// All in memory.
     Memory(PointBuffer),
     /// In runs, few enough to be merged at once.
-    Runs(Vec<Run>, ScratchDir),
+    Runs(Vec<Run>, Arc<ScratchDir>),
 }
 
 /// Told about points done in a stage; an error stops the sort.
@@ -48,14 +85,35 @@ impl Sorter {
     /// An empty sorter; scratch is touched by the first spill.
     pub fn new(volume: &Arc<dyn Volume>, scratch_dir: &Path, budget: Budget) -> Self {
         Self {
-            buffer: PointBuffer::new(budget.run_points),
+            buffer: PointBuffer::new(budget.core_points),
+            spilling: Spilling::default(),
             runs: Vec::new(),
             scratch: None,
             volume: volume.clone(),
             scratch_dir: scratch_dir.to_owned(),
             budget,
+            expected: 0,
             traffic: Traffic::default(),
         }
+    }
+
+    /// Says how many points the input says it has, before any are given. It may be wrong.
+    pub fn expect(&mut self, points: Option<u64>) {
+        // An estimate need not be exact.
+        self.expected = points.map_or(0, |points| (points as f64 * LEN_HINT_TRUST) as u64);
+        if !self.fits_core() {
+            self.buffer = PointBuffer::new(self.budget.run_points);
+        }
+    }
+
+    /// Whether the points are expected to need no runs.
+    pub fn fits_core(&self) -> bool {
+        self.expected <= self.budget.core_points as u64
+    }
+
+    /// Threads to work with.
+    pub fn threads(&self) -> usize {
+        self.budget.gang.threads
     }
 
     /// Points in memory.
@@ -68,41 +126,51 @@ impl Sorter {
         self.traffic
     }
 
-    /// Sorts the points in memory and writes them to scratch as a run. `expected` is how many points the input says it
-    /// has.
+    /// Begins to sort the points in memory and to write them to scratch as a run; waits for the run before.
     ///
     /// # Errors
-    /// [`StoreError::NoSpace`] before anything is written where the runs obviously do not fit; other errors of scratch;
-    /// those of `watch`.
-    pub fn spill(&mut self, quantizer: &Quantizer, expected: Option<u64>, watch: Watch<'_>) -> Result<(), BuildError> {
+    /// [`StoreError::NoSpace`] before anything is written where the runs obviously do not fit; other errors of scratch,
+    /// which may be those of the run before.
+    pub fn spill(&mut self, quantizer: &Quantizer) -> Result<(), BuildError> {
+        let spare = self.settle()?;
         let scratch = match &mut self.scratch {
             Some(scratch) => scratch,
-            none => none.insert(ScratchDir::create(&self.volume, &self.scratch_dir)?),
+            none => none.insert(Arc::new(ScratchDir::create(&self.volume, &self.scratch_dir)?)),
         };
         let spilled: u64 = self.runs.iter().map(Run::records).sum();
-        let hinted = expected.map_or(0, |points| (points as f64 * LEN_HINT_TRUST) as u64);
-        let left = hinted.saturating_sub(spilled).max(self.buffer.len() as u64);
+        let left = self.expected.saturating_sub(spilled).max(self.buffer.len() as u64);
         let needed = left.saturating_mul(size_of::<PointRecord>() as u64);
         check_room(scratch.free_bytes()?, needed, scratch.path())?;
-        let mut writer = RunWriter::create(scratch, self.traffic.runs)?;
-        let sorted = self.buffer.sorted(quantizer);
-        for (done, (_, point)) in sorted.iter().enumerate() {
-            writer.push(point)?;
-            if done.is_multiple_of(BATCH_POINTS) {
-                watch(done as u64)?;
-            }
-        }
-        let run = writer.finish()?;
+        // The first buffer may have grown for points that were expected to stay in memory: then there is no room beside.
+        let oversized = self.buffer.capacity() > self.budget.run_points;
+        let next = spare.unwrap_or_else(|| PointBuffer::new(self.budget.run_points));
+        let full = std::mem::replace(&mut self.buffer, next);
+        let (scratch, quantizer, threads) = (scratch.clone(), *quantizer, self.threads());
+        let number = self.traffic.runs;
         self.traffic.runs += 1;
-        self.traffic.bytes_written += run.bytes();
-        self.runs.push(run);
-        self.buffer.clear();
+        let spill = move || write_run(&scratch, number, full, &quantizer, threads);
+        let thread = Builder::new().name("pbgi-sort".to_owned()).spawn(spill);
+        self.spilling.0 = Some(thread.map_err(BuildError::Thread)?);
+        if oversized {
+            self.settle()?;
+        }
         Ok(())
+    }
+
+    /// Waits for the run that is being made; returns its memory.
+    fn settle(&mut self) -> Result<Option<PointBuffer>, StoreError> {
+        let Some(Spilled { run, buffer, seconds }) = self.spilling.wait()? else {
+            return Ok(None);
+        };
+        self.traffic.bytes_written += run.bytes();
+        self.traffic.spill_seconds += seconds;
+        self.runs.push(run);
+        Ok((buffer.capacity() <= self.budget.run_points).then_some(buffer))
     }
 
     /// Whether something was spilled.
     pub fn has_runs(&self) -> bool {
-        !self.runs.is_empty()
+        self.scratch.is_some()
     }
 
     /// Ends: spills what is left if there are runs, and merges runs until the last merge can take them all.
@@ -110,6 +178,13 @@ impl Sorter {
     /// # Errors
     /// Those of scratch and of `watch`.
     pub fn finish(mut self, quantizer: &Quantizer, watch: Watch<'_>) -> Result<(SortResult, Traffic), BuildError> {
+        if !self.has_runs() {
+            return Ok((SortResult::Memory(self.buffer), self.traffic));
+        }
+        if !self.buffer.is_empty() {
+            self.spill(quantizer)?;
+        }
+        self.settle()?;
         let Some(scratch) = self.scratch.take() else {
             return Ok((SortResult::Memory(self.buffer), self.traffic));
         };
@@ -138,6 +213,29 @@ impl Sorter {
         self.traffic.bytes_read += self.runs.iter().map(Run::bytes).sum::<u64>();
         Ok((SortResult::Runs(self.runs, scratch), self.traffic))
     }
+}
+
+/// Sorts a buffer and writes it as run `number`.
+fn write_run(
+    scratch: &ScratchDir,
+    number: u64,
+    mut buffer: PointBuffer,
+    quantizer: &Quantizer,
+    threads: usize,
+) -> Result<Spilled, StoreError> {
+    let started = Instant::now();
+    let order = buffer.sorted(quantizer, threads);
+    let mut writer = RunWriter::create(scratch, number)?;
+    for point in order.iter(&buffer) {
+        writer.push(point)?;
+    }
+    let run = writer.finish()?;
+    buffer.clear();
+    Ok(Spilled {
+        run,
+        buffer,
+        seconds: started.elapsed().as_secs_f64(),
+    })
 }
 
 /// Merges consecutive runs into one.

@@ -1,7 +1,8 @@
 //! The same points and settings make the same files, whatever the memory, the runs and the order of input.
 
 use crate::support::{Cloud, Place, build_cloud, sheet, shuffled, small_pages};
-use pbgi_build::BuildReport;
+use pbgi_build::{BuildHost, BuildReport};
+use pbgi_core::BuildSettings;
 use std::fs;
 
 const POINTS: usize = 37_000;
@@ -36,6 +37,37 @@ fn one_run_or_thirty_seven_and_any_merge_make_the_same_bytes() {
         assert_eq!(report.runs, runs, "{run_points} points a run, {fan_in} at once");
         assert!(report.bytes_read >= POINTS as u64 * 32);
         assert!(report.bytes_written > report.bytes_read);
+    }
+}
+
+#[test]
+fn any_number_of_threads_and_any_size_of_jobs_make_the_same_bytes() {
+    // Dense places that no job holds as a whole: a leaf of the deepest level, and coincident points.
+    let mut points = sheet(POINTS);
+    points.extend(vec![points[17]; 500]);
+    for chunk_levels in [0, 1, 3] {
+        let build = |threads, job_points_max, run_points_max| {
+            let place = Place::on_disk();
+            let host = BuildHost {
+                threads,
+                job_points_max,
+                run_points_max,
+                ..place.host()
+            };
+            let settings = BuildSettings {
+                chunk_levels,
+                ..small_pages()
+            };
+            build_cloud(&Cloud::new(points.clone()), &place, &host, settings).unwrap();
+            ["nodes.pages", "points.pages", "manifest.toml"].map(|name| fs::read(place.output().join(name)).unwrap())
+        };
+        let expected = build(1, usize::MAX, usize::MAX);
+        for (threads, job_points, run_points) in
+            [(2, 16, usize::MAX), (2, 100, usize::MAX), (5, 1000, usize::MAX), (3, 17, 5000), (8, 4096, 20_000)]
+        {
+            let made = build(threads, job_points, run_points);
+            assert!(made == expected, "{threads} threads, {job_points} points a job, {chunk_levels} chunk levels");
+        }
     }
 }
 
