@@ -1,15 +1,15 @@
 //! From a binary PLY of lit points to a published scene: time and rate of every stage, what was read and written, and what
 //! the same bytes cost the disk alone, in the same run.
 //!
-//! `cargo bench -p pbgi-tests --bench build -- [--points 20000000] [--memory 4G] [--bounds] [--dir DIR]`
+//! `cargo bench -p pbgi-tests --bench build -- [--points 20000000] [--memory 4G] [--dir DIR]`
 
 #![allow(clippy::unwrap_used, reason = "a benchmark asserts")]
 
 use nix::fcntl::{PosixFadviseAdvice, posix_fadvise};
 use pbgi_build::{BuildReport, BuildRequest, Stage, build};
 use pbgi_core::point::Sides;
-use pbgi_core::{Bounds, BuildSettings, PointRecord, PointStream, Undecoded};
-use pbgi_points::{PointsError, SampleOptions, open_input, write_point_ply};
+use pbgi_core::{Bounds, BuildSettings, PointRecord, PointStream};
+use pbgi_points::{InputOptions, PlyForm, PointsError, open_input, write_point_ply};
 use pbgi_store::Overwrite;
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -43,7 +43,11 @@ impl Landscape {
             ([x.floor(), 3.0 * unit(noise >> 40), z], [1.0, 0.0, 0.0])
         } else {
             let height = (0.3 * x).sin() * (0.2 * z).cos();
-            let slope = [-0.3 * (0.3 * x).cos() * (0.2 * z).cos(), 1.0, 0.2 * (0.3 * x).sin() * (0.2 * z).sin()];
+            let slope = [
+                -0.3 * (0.3 * x).cos() * (0.2 * z).cos(),
+                1.0,
+                0.2 * (0.3 * x).sin() * (0.2 * z).sin(),
+            ];
             ([x, height, z], slope)
         };
         PointRecord::new(position, normal, radius, sides).unwrap()
@@ -75,40 +79,9 @@ impl PointStream for Landscape {
     }
 }
 
-/// A stream whose bounds the caller knows.
-struct Bounded {
-    inner: Box<dyn PointStream<Error = PointsError> + Send>,
-    bounds: Option<Bounds>,
-}
-
-impl PointStream for Bounded {
-    type Error = PointsError;
-
-    fn bounds(&self) -> Option<Bounds> {
-        self.bounds.or_else(|| self.inner.bounds())
-    }
-
-    fn len_hint(&self) -> Option<u64> {
-        self.inner.len_hint()
-    }
-
-    fn next_batch(&mut self, batch: &mut Vec<PointRecord>) -> Result<bool, PointsError> {
-        self.inner.next_batch(batch)
-    }
-
-    fn next_undecoded(&mut self) -> Result<Option<Undecoded<PointsError>>, PointsError> {
-        self.inner.next_undecoded()
-    }
-
-    fn rewind(&mut self) -> Result<(), PointsError> {
-        self.inner.rewind()
-    }
-}
-
 struct Options {
     points: u64,
     memory: u64,
-    bounds: bool,
     dir: PathBuf,
 }
 
@@ -116,7 +89,6 @@ fn options() -> Options {
     let mut options = Options {
         points: 20_000_000,
         memory: 4 << 30,
-        bounds: false,
         dir: std::env::temp_dir(),
     };
     let mut arguments = std::env::args().skip(1);
@@ -124,7 +96,6 @@ fn options() -> Options {
         match argument.as_str() {
             "--points" => options.points = arguments.next().unwrap().parse().unwrap(),
             "--memory" => options.memory = bytes(&arguments.next().unwrap()),
-            "--bounds" => options.bounds = true,
             "--dir" => options.dir = arguments.next().unwrap().into(),
             // Said by cargo.
             "--bench" => {}
@@ -161,7 +132,9 @@ fn raw_read(path: &Path) -> f64 {
 
 /// Seconds to write so many bytes and make them durable.
 fn raw_write(path: &Path, bytes: u64) -> f64 {
-    let buffer: Vec<u8> = (0..1 << 20).map(|i: u32| (i.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
+    let buffer: Vec<u8> = (0..1 << 20)
+        .map(|i: u32| (i.wrapping_mul(2_654_435_761) >> 13) as u8)
+        .collect();
     let started = Instant::now();
     let mut file = File::create(path).unwrap();
     let mut left = bytes;
@@ -193,19 +166,16 @@ fn main() {
         next: 0,
         points: options.points,
     };
-    write_point_ply(&input, &mut landscape, &mut |_| ControlFlow::Continue(())).unwrap();
+    write_point_ply(&input, PlyForm::Records, &mut landscape, &mut |_| {
+        ControlFlow::Continue(())
+    })
+    .unwrap();
     let input_bytes = fs::metadata(&input).unwrap().len();
     forget(&input);
     let raw_read_seconds = raw_read(&input);
     forget(&input);
 
-    let mut stream = Bounded {
-        inner: open_input(std::slice::from_ref(&input), &SampleOptions::default()).unwrap(),
-        bounds: options.bounds.then_some(Bounds {
-            min: [0.0, -1.0, 0.0],
-            max: [100.0, 3.0, 100.0],
-        }),
-    };
+    let mut stream = open_input(std::slice::from_ref(&input), &InputOptions::default()).unwrap();
     let request = BuildRequest {
         output: dir.path().join("scene.pbgi"),
         overwrite: Overwrite::Refuse,
@@ -235,7 +205,11 @@ fn main() {
     let raw_write_seconds = raw_write(&dir.path().join("raw"), scene_bytes);
     print(&options, &report, seconds, cpu - cpu_before, peak);
     let mega = |bytes: u64, seconds: f64| bytes as f64 / 1e6 / seconds;
-    println!("input {:.2} GB, scene {:.2} GB", input_bytes as f64 / 1e9, scene_bytes as f64 / 1e9);
+    println!(
+        "input {:.2} GB, scene {:.2} GB",
+        input_bytes as f64 / 1e9,
+        scene_bytes as f64 / 1e9
+    );
     println!(
         "disk alone: read {:.0} MB/s ({raw_read_seconds:.2} s for the input), written and synced {:.0} MB/s \
          ({raw_write_seconds:.2} s for the scene)",

@@ -181,7 +181,10 @@ impl Job<'_> {
         let quantizer = quantizer.filter(|_| tally.points > 0);
         let settings = self.request.settings;
         SceneInfo {
-            build_id: constructed.hash.clone().finish(tally.points, quantizer.as_ref(), &settings),
+            build_id: constructed
+                .hash
+                .clone()
+                .finish(tally.points, quantizer.as_ref(), &settings),
             point_count: tally.points,
             node_count: constructed.placed.tallies.nodes,
             node_slots,

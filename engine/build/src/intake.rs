@@ -1,11 +1,11 @@
-//! The first stage: every point is taken from the input, looked at once, and given to the sorter. Decoding and looking
-//! are done by several threads; the order is that of the input.
+//! The first stage: every point is taken from the input, looked at once, and given to the sorter. Looking is
+//! done by several threads beside reading; the order is that of the input.
 
 use crate::error::BuildError;
 use crate::report::{BuildProgress, Stage, StageSeconds};
 use crate::sort::sorter::Sorter;
 use pbgi_core::limits::HALF_MAX;
-use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream, Quantizer, Undecoded};
+use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream, Quantizer};
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -196,35 +196,30 @@ struct Pass {
     records_max: u64,
 }
 
-/// A batch that has been decoded and looked at.
+/// A batch that has been looked at.
 struct Looked {
     points: Vec<PointRecord>,
     tally: Tally,
 }
 
-type Answer<E> = Result<Looked, E>;
-type Question<E> = (Undecoded<E>, SyncSender<Answer<E>>);
+type Question = (Vec<PointRecord>, SyncSender<Looked>);
 
-/// Decodes and looks until there is nothing more to decode.
-fn look<E>(questions: &Mutex<Receiver<Question<E>>>, declared: Option<&Bounds>) {
+/// Looks at batches until there are none any more.
+fn look(questions: &Mutex<Receiver<Question>>, declared: Option<&Bounds>) {
     loop {
         let next = questions.lock().unwrap_or_else(PoisonError::into_inner).recv();
-        let Ok((decode, answer)) = next else { return };
-        let mut points = Vec::new();
-        let looked = decode(&mut points).map(|()| {
-            let mut tally = Tally::default();
-            let mut usable = true;
-            for point in &points {
-                usable &= tally.add(point, declared);
-            }
-            if !usable {
-                // The build ends in an error: no need to keep the good ones among them.
-                points.clear();
-            }
-            Looked { points, tally }
-        });
+        let Ok((mut points, answer)) = next else { return };
+        let mut tally = Tally::default();
+        let mut usable = true;
+        for point in &points {
+            usable &= tally.add(point, declared);
+        }
+        if !usable {
+            // The build ends in an error: no need to keep the good ones among them.
+            points.clear();
+        }
         // Nobody waits for it when the build has failed.
-        let _ = answer.send(looked);
+        let _ = answer.send(Looked { points, tally });
     }
 }
 
@@ -244,25 +239,26 @@ impl Pass {
             for _ in 0..threads {
                 let questions = &questions;
                 let started = Builder::new()
-                    .name("pbgi-decode".to_owned())
+                    .name("pbgi-look".to_owned())
                     .spawn_scoped(scope, move || look(questions, declared.as_ref()));
                 started.map_err(BuildError::Thread)?;
             }
             // Moved in, so that the threads end when this does.
-            let ask: SyncSender<Question<S::Error>> = ask;
-            let mut asked = VecDeque::new();
+            let ask: SyncSender<Question> = ask;
+            let (mut asked, mut spare) = (VecDeque::new(), Vec::new());
             let mut end: Option<Result<(), S::Error>> = None;
             loop {
                 let started = Instant::now();
                 while end.is_none() && asked.len() < 2 * threads {
-                    match stream.next_undecoded() {
-                        Ok(Some(undecoded)) => {
+                    let mut batch: Vec<PointRecord> = spare.pop().unwrap_or_default();
+                    match stream.next_batch(&mut batch) {
+                        Ok(true) => {
                             let (answer, looked) = sync_channel(1);
                             asked.push_back(looked);
                             // Fails only when every thread has panicked, which the scope tells.
-                            let _ = ask.send((undecoded, answer));
+                            let _ = ask.send((batch, answer));
                         }
-                        Ok(None) => end = Some(Ok(())),
+                        Ok(false) => end = Some(Ok(())),
                         Err(error) => end = Some(Err(error)),
                     }
                 }
@@ -271,9 +267,11 @@ impl Pass {
                     end.unwrap_or(Ok(())).map_err(BuildError::Input)?;
                     return self.tally.check().map_err(BuildError::widen);
                 };
-                if let Ok(looked) = next.recv() {
-                    let looked = looked.map_err(BuildError::Input)?;
-                    self.take(&looked, total, sorter, watcher).map_err(BuildError::widen)?;
+                if let Ok(Looked { mut points, tally }) = next.recv() {
+                    self.take(&points, &tally, total, sorter, watcher)
+                        .map_err(BuildError::widen)?;
+                    points.clear();
+                    spare.push(points);
                 }
                 self.seconds.reading += started.elapsed().as_secs_f64();
                 let told = watcher.tell(Stage::Reading, self.tally.points, total);
@@ -284,19 +282,20 @@ impl Pass {
 
     fn take(
         &mut self,
-        looked: &Looked,
+        points: &[PointRecord],
+        tally: &Tally,
         total: Option<u64>,
         sorter: &mut Sorter,
         watcher: &mut Watcher<'_>,
     ) -> Result<(), BuildError> {
-        self.tally.merge(&looked.tally);
+        self.tally.merge(tally);
         if self.tally.points > self.records_max {
             return Err(BuildError::Limit {
                 what: "points",
                 max: self.records_max,
             });
         }
-        let mut points = looked.points.as_slice();
+        let mut points = points;
         while self.keeps && !points.is_empty() {
             if sorter.buffer().room() == 0 {
                 self.make_room(total, sorter, watcher)?;

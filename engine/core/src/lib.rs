@@ -32,5 +32,5 @@ pub use point::{InvalidPoint, PointRecord};
 pub use scene::SceneInfo;
 pub use settings::{BuildSettings, SettingsError, ShadeSettings};
 pub use statistics::Statistics;
-pub use stream::{PointStream, Undecoded};
+pub use stream::PointStream;
 pub use voxel::Voxel;

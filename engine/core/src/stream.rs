@@ -3,9 +3,6 @@
 use crate::bounds::Bounds;
 use crate::point::PointRecord;
 
-/// A batch that has been read but not decoded: appends its points. Any thread may run it.
-pub type Undecoded<E> = Box<dyn FnOnce(&mut Vec<PointRecord>) -> Result<(), E> + Send>;
-
 /// A source of points that need not fit in memory. It can be read more than once, always to the same points in the same
 /// order.
 pub trait PointStream {
@@ -23,23 +20,6 @@ pub trait PointStream {
     /// # Errors
     /// Unreadable input or an invalid point, named with its index.
     fn next_batch(&mut self, batch: &mut Vec<PointRecord>) -> Result<bool, Self::Error>;
-
-    /// The next batch for a caller that decodes several at once; `None` when there was none left. Sources whose decoding
-    /// is dear leave it to the returned function.
-    ///
-    /// # Errors
-    /// As [`Self::next_batch`].
-    fn next_undecoded(&mut self) -> Result<Option<Undecoded<Self::Error>>, Self::Error> {
-        let mut batch = Vec::new();
-        let more = self.next_batch(&mut batch)?;
-        Ok((more || !batch.is_empty()).then(|| {
-            let decode = move |points: &mut Vec<PointRecord>| {
-                points.append(&mut batch);
-                Ok(())
-            };
-            Box::new(decode) as Undecoded<Self::Error>
-        }))
-    }
 
     /// Goes back to the first point.
     ///

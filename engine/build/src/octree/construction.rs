@@ -119,7 +119,9 @@ pub fn construct(
             to_writer,
             waited: Duration::ZERO,
         };
-        let planner = start(scope, "pbgi-plan", move || dispatcher.run(feed, common, gang.job_points))?;
+        let planner = start(scope, "pbgi-plan", move || {
+            dispatcher.run(feed, common, gang.job_points)
+        })?;
         let placement = Placement::new(writer, quantizer, settings, records_max);
         // The channel goes with it, so that the others end when this does.
         let written = write(placement, parts, common, tell);

@@ -3,8 +3,8 @@
 
 use bytemuck::Zeroable;
 use pbgi_core::limits::MORTON_BITS;
-use pbgi_core::{ClusterAccumulator, MortonCode, NodeIndex, NodeKind, NodeRecord, PointIndex, PointRecord, Voxel};
 use pbgi_core::{BuildSettings, Quantizer};
+use pbgi_core::{ClusterAccumulator, MortonCode, NodeIndex, NodeKind, NodeRecord, PointIndex, PointRecord, Voxel};
 
 /// A finalized node that its parent has yet to place, and its sums.
 #[derive(Clone, Debug)]
@@ -113,7 +113,13 @@ impl SubtreeBuilder<'_> {
             count: count as u8,
         });
         let first = NodeIndex(0);
-        finalize(voxel, NodeKind::Inner { first, mask }, sum, self.quantizer, &mut self.out.tallies)
+        finalize(
+            voxel,
+            NodeKind::Inner { first, mask },
+            sum,
+            self.quantizer,
+            &mut self.out.tallies,
+        )
     }
 
     fn leaf(&mut self, voxel: Voxel, from: usize, to: usize) -> Subtree {

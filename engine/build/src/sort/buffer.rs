@@ -113,9 +113,7 @@ impl PointBuffer {
                 });
             }
         });
-        keys.radix_sort_builder()
-            .with_parallel(threads > 1)
-            .sort();
+        keys.radix_sort_builder().with_parallel(threads > 1).sort();
         Order { keys }
     }
 

@@ -62,11 +62,18 @@ fn any_number_of_threads_and_any_size_of_jobs_make_the_same_bytes() {
             ["nodes.pages", "points.pages", "manifest.toml"].map(|name| fs::read(place.output().join(name)).unwrap())
         };
         let expected = build(1, usize::MAX, usize::MAX);
-        for (threads, job_points, run_points) in
-            [(2, 16, usize::MAX), (2, 100, usize::MAX), (5, 1000, usize::MAX), (3, 17, 5000), (8, 4096, 20_000)]
-        {
+        for (threads, job_points, run_points) in [
+            (2, 16, usize::MAX),
+            (2, 100, usize::MAX),
+            (5, 1000, usize::MAX),
+            (3, 17, 5000),
+            (8, 4096, 20_000),
+        ] {
             let made = build(threads, job_points, run_points);
-            assert!(made == expected, "{threads} threads, {job_points} points a job, {chunk_levels} chunk levels");
+            assert!(
+                made == expected,
+                "{threads} threads, {job_points} points a job, {chunk_levels} chunk levels"
+            );
         }
     }
 }
