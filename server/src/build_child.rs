@@ -12,8 +12,11 @@ use pbgi_core::{BuildSettings, Statistics};
 use pbgi_points::{CloudOptions, InputOptions};
 use pbgi_store::Overwrite;
 use serde::{Deserialize, Serialize};
+use std::fs;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::{self, Read, Write};
 use std::ops::ControlFlow;
+use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -72,6 +75,9 @@ pub enum Report {
     },
 }
 
+/// Kinds of clouds that are one file, whose points follow from its content.
+const RESUMABLE: [&str; 4] = ["ply", "las", "laz", "ptc"];
+
 /// Time between two progress lines.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -115,6 +121,8 @@ fn obey_the_daemon(spec: &Spec) -> Result<(), String> {
 }
 
 fn build_scene(spec: &Spec) -> Result<Statistics, String> {
+    // Opened while it may be.
+    let traffic = fs::File::open("/proc/self/io");
     if let Some(directories) = &spec.confine {
         confine(directories)?;
     }
@@ -144,6 +152,7 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
         scratch_dir: spec.scratch_dir.clone(),
         memory_bytes: spec.memory_bytes.saturating_sub(points.memory_bytes()),
         settings: spec.settings,
+        input_key: input_key(spec),
     };
     let mut last = None;
     let mut observer = |progress: BuildProgress| {
@@ -165,10 +174,32 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
         }
     };
     let report = build(&mut points, &request, &mut observer).map_err(|error| error.to_string())?;
+    let (bytes_read, bytes_written) = traffic.map(transferred).unwrap_or_default();
     Ok(Statistics {
         points_skipped: Some(points.skipped() as f64),
+        bytes_read,
+        bytes_written,
         ..statistics(&report)
     })
+}
+
+/// A digest of everything that decides which points the input has; `None` where that is not known: meshes name further
+/// files.
+fn input_key(spec: &Spec) -> Option<u64> {
+    // Keys without state: the same in the next process.
+    let mut hasher = DefaultHasher::new();
+    for path in &spec.inputs {
+        let extension = path.extension()?.to_ascii_lowercase();
+        if !RESUMABLE.iter().any(|known| extension == *known) {
+            return None;
+        }
+        let file = fs::metadata(path).ok()?;
+        (path, file.len(), file.ino(), file.mtime(), file.mtime_nsec()).hash(&mut hasher);
+    }
+    serde_json::to_string(&(&spec.cloud, env!("CARGO_PKG_VERSION")))
+        .ok()?
+        .hash(&mut hasher);
+    Some(hasher.finish())
 }
 
 /// Set by SIGTERM. The signal is blocked in every thread and waited for in one, which needs no handler.
@@ -198,10 +229,19 @@ fn statistics(report: &BuildReport) -> Statistics {
         sort_seconds: Some(report.sort_seconds),
         build_seconds: Some(report.build_seconds),
         out_of_core_bytes: count(report.info.out_of_core_bytes()),
-        bytes_read: count(report.bytes_read),
-        bytes_written: count(report.bytes_written),
         ..Statistics::default()
     }
+}
+
+/// Bytes that this process has read and written, as the system counts them: input, scratch and scene.
+fn transferred(mut io: fs::File) -> (Option<f64>, Option<f64>) {
+    let mut text = String::new();
+    let _ = io.read_to_string(&mut text);
+    let count = |name: &str| {
+        text.lines()
+            .find_map(|line| line.strip_prefix(name)?.trim().parse().ok())
+    };
+    (count("rchar:"), count("wchar:"))
 }
 
 fn say(report: &Report) -> bool {

@@ -182,6 +182,7 @@ fn main() {
         scratch_dir: scratch,
         memory_bytes: options.memory,
         settings: BuildSettings::default(),
+        input_key: None,
     };
     let (_, cpu_before) = process_figures();
     let started = Instant::now();

@@ -3,6 +3,7 @@
 use crate::budget::Budget;
 use crate::error::BuildError;
 use crate::intake::{Intake, Watcher, take_in};
+use crate::limits::DISK_WATCH_POINTS;
 use crate::octree::construction::{Constructed, construct};
 use crate::report::{BuildProgress, BuildReport, BuildRequest, Stage};
 use crate::sort::Feed;
@@ -11,8 +12,9 @@ use crate::sort::merge::{Merge, MergeFeed};
 use crate::sort::sorter::{SortResult, Sorter, Traffic, check_room};
 use pbgi_core::{PointRecord, PointStream, Quantizer, SceneInfo};
 use pbgi_store::limits::RECORDS_MAX;
-use pbgi_store::{OsVolume, SceneWriter, Volume};
+use pbgi_store::{OsVolume, SceneWriter, StoreError, Volume};
 use std::ops::ControlFlow;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -78,10 +80,11 @@ pub fn build_on<S: PointStream + ?Sized>(
     let mut watcher = Watcher(observer);
     // First of all, so that an output that cannot be written is known before the points are sorted.
     let writer = SceneWriter::create(&host.volume, &request.output, request.overwrite, &request.settings)?;
-    let mut sorter = Sorter::new(&host.volume, &request.scratch_dir, budget);
+    let mut sorter = Sorter::new(&host.volume, &request.scratch_dir, request.input_key, budget);
     let intake = take_in(stream, &mut sorter, host.records_max, &mut watcher)?;
     let job = Job {
         request,
+        volume: host.volume.as_ref(),
         records_max: host.records_max,
         budget,
         intake,
@@ -93,6 +96,7 @@ pub fn build_on<S: PointStream + ?Sized>(
 /// A build whose points are in the sorter.
 struct Job<'a> {
     request: &'a BuildRequest,
+    volume: &'a dyn Volume,
     records_max: u64,
     budget: Budget,
     intake: Intake,
@@ -146,6 +150,7 @@ impl Job<'_> {
             bytes_read: traffic.bytes_read,
             bytes_written: traffic.bytes_written + scene_bytes,
             runs: traffic.runs,
+            runs_resumed: traffic.runs_resumed,
             radiance_clamped: self.intake.tally.radiance_clamped,
             harmonics_clamped: constructed.placed.tallies.harmonics_clamped,
             overflow_points: constructed.placed.tallies.overflow_points,
@@ -168,9 +173,22 @@ impl Job<'_> {
         writer: &mut SceneWriter,
         quantizer: &Quantizer,
     ) -> Result<Constructed, BuildError> {
-        let total = Some(self.intake.tally.points);
+        let points = self.intake.tally.points;
         let watcher = &mut self.watcher;
-        let mut tell = |done| watcher.tell(Stage::Building, done, total);
+        let mut looked_at = 0;
+        let mut tell = |done: u64| {
+            if done >= looked_at + DISK_WATCH_POINTS {
+                looked_at = done;
+                // Others fill the disk as well: what cannot end well is ended now.
+                let left = (points - done) * size_of::<PointRecord>() as u64;
+                check_room(
+                    free_bytes(self.volume, &self.request.output)?,
+                    left,
+                    &self.request.output,
+                )?;
+            }
+            watcher.tell(Stage::Building, done, Some(points))
+        };
         let (settings, gang) = (&self.request.settings, self.budget.gang);
         construct(feed, writer, quantizer, settings, gang, self.records_max, &mut tell)
     }
@@ -195,4 +213,15 @@ impl Job<'_> {
             settings,
         }
     }
+}
+
+/// What may still be written beside `output`.
+fn free_bytes(volume: &dyn Volume, output: &Path) -> Result<u64, StoreError> {
+    let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let folder = folder.unwrap_or(Path::new("."));
+    volume.free_bytes(folder).map_err(|source| StoreError::Io {
+        action: "read free space",
+        path: folder.to_owned(),
+        source,
+    })
 }

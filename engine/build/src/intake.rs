@@ -160,6 +160,7 @@ pub(crate) fn take_in<S: PointStream + ?Sized>(
         tally: Tally::default(),
         seconds: StageSeconds::default(),
         records_max,
+        resumed: 0,
     };
     pass.run(stream, sorter, watcher)?;
     if !pass.keeps {
@@ -194,6 +195,8 @@ struct Pass {
     tally: Tally,
     seconds: StageSeconds,
     records_max: u64,
+    /// Points to come that are in runs already: they are looked at again, and not kept.
+    resumed: u64,
 }
 
 /// A batch that has been looked at.
@@ -230,6 +233,11 @@ impl Pass {
         sorter: &mut Sorter,
         watcher: &mut Watcher<'_>,
     ) -> Result<(), BuildError<S::Error>> {
+        if let Some(quantizer) = &self.quantizer
+            && !sorter.fits_core()
+        {
+            self.resumed = sorter.resume(quantizer)?;
+        }
         let total = stream.len_hint();
         let threads = sorter.threads();
         let declared = self.declared;
@@ -295,7 +303,9 @@ impl Pass {
                 max: self.records_max,
             });
         }
-        let mut points = points;
+        let known = self.resumed.min(points.len() as u64);
+        self.resumed -= known;
+        let mut points = &points[known as usize..];
         while self.keeps && !points.is_empty() {
             if sorter.buffer().room() == 0 {
                 self.make_room(total, sorter, watcher)?;

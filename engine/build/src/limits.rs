@@ -30,3 +30,6 @@ pub const BLOCKS_PER_READ_MAX: usize = 16;
 
 /// An input may overstate its number of points by this much before a full disk is reported too early.
 pub const LEN_HINT_TRUST: f64 = 0.9;
+
+/// Points written between two looks at the space that is left on the disk: half a gigabyte of scene.
+pub const DISK_WATCH_POINTS: u64 = 10_000_000;

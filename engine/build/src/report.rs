@@ -18,6 +18,9 @@ pub struct BuildRequest {
     pub memory_bytes: u64,
     /// Shape and layout of the octree.
     pub settings: BuildSettings,
+    /// What the input is, where the caller can tell: requests with the same value read the same points in the same order.
+    /// The runs of a build that is killed then wait in `scratch_dir`, and the next one with this value goes on from them.
+    pub input_key: Option<u64>,
 }
 
 /// What a build is doing.
@@ -90,6 +93,8 @@ pub struct BuildReport {
     pub bytes_written: u64,
     /// Sorted runs written to scratch, those of intermediate merges included; 0 if the points fit the memory.
     pub runs: u64,
+    /// Runs among them that a killed build had left, so that they were not written again.
+    pub runs_resumed: u64,
     /// Points with a radiance at the largest value a half-precision float holds: clamped, as far as one can tell.
     pub radiance_clamped: u64,
     /// Harmonics of nodes that left the range of a half-precision float and were clamped.

@@ -1,5 +1,6 @@
 //! From points to clusters: the sums that make a node, added point by point in leaves and child by child above.
 
+use crate::limits::HALF_MAX;
 use crate::morton::Quantizer;
 use crate::node::NodeAttributes;
 use crate::pack::pack_harmonics;
@@ -61,7 +62,9 @@ impl ClusterAccumulator {
     /// Adds one point. Moments are taken about the lattice's origin, which keeps them exact far from the world's.
     pub fn add(&mut self, point: &PointRecord, quantizer: &Quantizer) {
         let normal = point.normal();
-        let area = f64::from(point.area());
+        let radius = f64::from(point.radius);
+        // Not `point.area()`: the square of a radius that a single holds may be one that it does not.
+        let area = std::f64::consts::PI * radius * radius;
         let sides = point.sides();
         let front = project_cosine(normal);
         let back = project_cosine(-normal);
@@ -74,7 +77,7 @@ impl ClusterAccumulator {
         }
         let position = DVec3::from_array(point.position.map(f64::from)) - DVec3::from_array(quantizer.origin);
         let normal = normal.as_dvec3();
-        let spread = f64::from(point.radius) * f64::from(point.radius) / 4.0;
+        let spread = radius * radius / 4.0;
         self.area += area;
         self.first_moment += position * area;
         self.normal += normal * area;
@@ -120,7 +123,9 @@ impl ClusterAccumulator {
         for i in 0..6 {
             let variance = self.second_moment[i] / self.area - mean_outer[i];
             let variance = if i < 3 { variance.max(0.0) } else { variance };
-            covariance[i] = (variance / (edge * edge)) as f32;
+            // Discs may be far wider than their voxel.
+            let limit = f64::from(HALF_MAX);
+            covariance[i] = (variance / (edge * edge)).clamp(-limit, limit) as f32;
         }
         let axis = self.axis();
         let aligned = quadratic_form(&self.normal_moment, axis) / self.area;
@@ -146,19 +151,21 @@ impl ClusterAccumulator {
 
     /// Principal axis of the normals, on the side that most area faces: the dominant eigenvector of their second moment.
     fn axis(&self) -> DVec3 {
-        // Enough for a flat cluster to converge to machine precision; a round one has no axis to converge to.
-        const STEPS: usize = 12;
+        // The sixteenth power: a flat cluster has converged to machine precision; a round one has no axis to converge to.
+        const SQUARINGS: usize = 4;
         let [xx, yy, zz, xy, xz, yz] = self.normal_moment;
-        let matrix = DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz));
-        // The columns of a matrix of rank one are multiples of the axis; the longest is the safest start.
-        let columns = [matrix.x_axis, matrix.y_axis, matrix.z_axis];
-        let start = columns
+        let mut power = DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz));
+        for _ in 0..SQUARINGS {
+            // The trace of a second moment is not zero, and stays above a third of its square when that is taken.
+            power *= 1.0 / (power.x_axis.x + power.y_axis.y + power.z_axis.z);
+            power *= power;
+        }
+        // The columns of a matrix of rank one are multiples of the axis; the longest is the most exact.
+        let columns = [power.x_axis, power.y_axis, power.z_axis];
+        let longest = columns
             .into_iter()
             .max_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
-        let mut axis = start.and_then(DVec3::try_normalize).unwrap_or(DVec3::Z);
-        for _ in 0..STEPS {
-            axis = (matrix * axis).try_normalize().unwrap_or(axis);
-        }
+        let axis = longest.and_then(DVec3::try_normalize).unwrap_or(DVec3::Z);
         if axis.dot(self.normal) < 0.0 { -axis } else { axis }
     }
 }

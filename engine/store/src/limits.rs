@@ -22,6 +22,12 @@ pub const SYNC_BEHIND_BYTES: u64 = 32 << 20;
 /// 190 runs at once.
 pub const RUN_BLOCK_RECORDS: usize = 8192;
 
+/// Longest seal of a run read: of a run as long as indices allow.
+pub const SEAL_BYTES_MAX: u64 = 4 << 20;
+
+/// How long the runs of a killed build are kept for the next try.
+pub const RUNS_KEPT: Duration = Duration::from_secs(24 * 3600);
+
 /// Longest manifest read: a real one has about 1 KiB.
 pub const MANIFEST_BYTES_MAX: u64 = 64 << 10;
 

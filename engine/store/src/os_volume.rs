@@ -7,6 +7,7 @@ use std::fs::{self, DirBuilder, File, FileType, OpenOptions, TryLockError};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt};
 use std::path::Path;
+use std::time::Duration;
 
 /// Files of the operating system. Linux only: publishing needs `renameat2`.
 #[derive(Clone, Copy, Debug, Default)]
@@ -105,6 +106,11 @@ impl Volume for OsVolume {
     fn free_bytes(&self, dir: &Path) -> io::Result<u64> {
         let stat = nix::sys::statvfs::statvfs(dir)?;
         Ok(stat.blocks_available().saturating_mul(stat.fragment_size()))
+    }
+
+    fn age(&self, dir: &Path) -> io::Result<Duration> {
+        // A clock that was set back makes everything new.
+        Ok(fs::metadata(dir)?.modified()?.elapsed().unwrap_or_default())
     }
 
     fn try_lock(&self, path: &Path) -> io::Result<Option<Lock>> {

@@ -1,11 +1,11 @@
 //! Sort runs: sorted points on scratch, written once, read once, front to back, then deleted.
 //!
-//! A run is a file of plain records. It never outlives the process that wrote it, so its length and the checksum of
-//! every block stay in memory.
+//! A run is a file of plain records. Its length and the checksum of every block stay in memory; a run that may outlive
+//! its process has them in a file beside it as well, its seal, written when the run is complete.
 
 use crate::data_file::DataFile;
 use crate::error::StoreError;
-use crate::limits::RUN_BLOCK_RECORDS;
+use crate::limits::{RUN_BLOCK_RECORDS, SEAL_BYTES_MAX};
 use crate::page_header::check_sum;
 use crate::scratch::ScratchDir;
 use crate::volume::Volume;
@@ -13,17 +13,38 @@ use bytemuck::Zeroable;
 use pbgi_core::PointRecord;
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 const PREFIX: &str = "run-";
+/// What the name of a seal has behind that of its run.
+const SEAL_SUFFIX: &str = ".seal";
+/// Start of a seal.
+const SEAL_MAGIC: [u8; 8] = *b"\x89PBGIrun";
 const DIGITS: usize = 6;
 const RECORD_BYTES: u64 = size_of::<PointRecord>() as u64;
 
-/// Whether a file in a scratch folder is a run.
+/// Whether a file in a scratch folder is a run or its seal.
 pub(crate) fn is_run_name(name: &OsStr) -> bool {
-    name.as_bytes()
-        .strip_prefix(PREFIX.as_bytes())
+    let name = name.as_bytes();
+    let name = name.strip_suffix(SEAL_SUFFIX.as_bytes()).unwrap_or(name);
+    name.strip_prefix(PREFIX.as_bytes())
         .is_some_and(|digits| digits.len() >= DIGITS && digits.iter().all(u8::is_ascii_digit))
+}
+
+/// Whether a file in a scratch folder is a seal.
+pub(crate) fn is_seal_name(name: &OsStr) -> bool {
+    is_run_name(name) && name.as_bytes().ends_with(SEAL_SUFFIX.as_bytes())
+}
+
+fn run_path(scratch: &Path, number: u64) -> PathBuf {
+    scratch.join(format!("{PREFIX}{number:0DIGITS$}"))
+}
+
+fn seal_path(run: &Path) -> PathBuf {
+    let mut path = run.as_os_str().to_owned();
+    path.push(SEAL_SUFFIX);
+    path.into()
 }
 
 /// A finished run. Dropping it deletes the file.
@@ -32,9 +53,51 @@ pub struct Run {
     volume: Arc<dyn Volume>,
     records: u64,
     checksums: Vec<u32>,
+    sealed: bool,
 }
 
 impl Run {
+    /// Opens run `number` of a folder that another process left, and what its writer noted on its seal; `None` if there is
+    /// no such run, or no whole one. Blocks are checked when they are read.
+    pub(crate) fn reopen(scratch: &ScratchDir, number: u64) -> Option<(Self, Vec<u8>)> {
+        let path = run_path(scratch.path(), number);
+        let seal = DataFile::open(scratch.volume(), &seal_path(&path)).ok()?;
+        let length = seal.byte_len().ok().filter(|length| *length <= SEAL_BYTES_MAX)?;
+        let mut bytes = vec![0; length as usize];
+        seal.read_at(0, &mut bytes, &|| "seal".to_owned()).ok()?;
+        let (records, note, checksums) = decode_seal(&bytes)?;
+        let run = Self {
+            file: DataFile::open(scratch.volume(), &path).ok()?,
+            volume: scratch.volume().clone(),
+            records,
+            checksums,
+            sealed: true,
+        };
+        if run.file.byte_len().ok()? == run.bytes() && run.checksums.len() as u64 == run.blocks() {
+            Some((run, note))
+        } else {
+            None
+        }
+    }
+
+    /// Its file and its seal.
+    pub(crate) fn names(&self) -> [PathBuf; 2] {
+        [self.file.path().to_owned(), seal_path(self.file.path())]
+    }
+
+    fn blocks(&self) -> u64 {
+        self.records.div_ceil(RUN_BLOCK_RECORDS as u64)
+    }
+
+    /// Writes the seal, with a note for whoever goes on from here.
+    fn seal(&mut self, note: &[u8]) -> Result<(), StoreError> {
+        let path = seal_path(self.file.path());
+        // Before it is written: a torn one is removed as well.
+        self.sealed = true;
+        let file = DataFile::create_new(&self.volume, &path)?;
+        file.write_at(0, &encode_seal(self.records, note, &self.checksums))
+    }
+
     /// Points in it.
     pub fn records(&self) -> u64 {
         self.records
@@ -48,9 +111,37 @@ impl Run {
 
 impl Drop for Run {
     fn drop(&mut self) {
-        // What stays behind goes with the scratch folder.
+        // What stays behind goes with the scratch folder. The seal goes first: without it, the run is nothing.
+        if self.sealed {
+            let _ = self.volume.remove_file(&seal_path(self.file.path()));
+        }
         let _ = self.volume.remove_file(self.file.path());
     }
+}
+
+/// `[magic | records u64 | length of the note u64 | note | checksums u32.. | CRC32C of all before]`
+fn encode_seal(records: u64, note: &[u8], checksums: &[u32]) -> Vec<u8> {
+    let mut bytes = SEAL_MAGIC.to_vec();
+    bytes.extend(records.to_le_bytes());
+    bytes.extend((note.len() as u64).to_le_bytes());
+    bytes.extend(note);
+    bytes.extend_from_slice(bytemuck::cast_slice(checksums));
+    bytes.extend(crc32c::crc32c(&bytes).to_le_bytes());
+    bytes
+}
+
+fn decode_seal(bytes: &[u8]) -> Option<(u64, Vec<u8>, Vec<u32>)> {
+    let (content, sum) = bytes.split_last_chunk::<4>()?;
+    if crc32c::crc32c(content) != u32::from_le_bytes(*sum) {
+        return None;
+    }
+    let rest = content.strip_prefix(&SEAL_MAGIC)?;
+    let (records, rest) = rest.split_first_chunk::<8>()?;
+    let (note_length, rest) = rest.split_first_chunk::<8>()?;
+    let note_length = usize::try_from(u64::from_le_bytes(*note_length)).ok()?;
+    let (note, table) = rest.split_at_checked(note_length)?;
+    let checksums = table.as_chunks::<4>().0.iter().map(|sum| u32::from_le_bytes(*sum));
+    Some((u64::from_le_bytes(*records), note.to_owned(), checksums.collect()))
 }
 
 /// Writes a run, block by block.
@@ -65,12 +156,13 @@ impl RunWriter {
     /// # Errors
     /// [`StoreError::NoSpace`], [`StoreError::Io`].
     pub fn create(scratch: &ScratchDir, number: u64) -> Result<Self, StoreError> {
-        let path = scratch.path().join(format!("{PREFIX}{number:0DIGITS$}"));
+        let path = run_path(scratch.path(), number);
         let run = Run {
             file: DataFile::create_new(scratch.volume(), &path)?,
             volume: scratch.volume().clone(),
             records: 0,
             checksums: Vec::new(),
+            sealed: false,
         };
         Ok(Self {
             run,
@@ -109,6 +201,17 @@ impl RunWriter {
             self.write_block()?;
         }
         Ok(self.run)
+    }
+
+    /// As [`Self::finish`], and seals the run, so that [`ScratchDir::sealed_runs`] finds it after the death of this
+    /// process. The system's memory outlives the process; a power loss is told by the checksums.
+    ///
+    /// # Errors
+    /// As [`Self::push`].
+    pub fn finish_sealed(self, note: &[u8]) -> Result<Run, StoreError> {
+        let mut run = self.finish()?;
+        run.seal(note)?;
+        Ok(run)
     }
 }
 

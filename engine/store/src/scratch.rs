@@ -1,11 +1,13 @@
-//! [`ScratchDir`]: a job's private folder for runs, deleted when the job ends, swept when its process died.
+//! [`ScratchDir`]: a job's private folder for runs, deleted when the job ends, taken over or swept when its process died.
 
+use crate::data_file::write_error;
 use crate::error::StoreError;
-use crate::limits::SCRATCH_MODE;
-use crate::run::is_run_name;
-use crate::temporary::{create_locked, is_suffix, remove_folder, unique_suffix};
+use crate::limits::{RUNS_KEPT, SCRATCH_MODE};
+use crate::run::{Run, is_run_name, is_seal_name};
+use crate::temporary::{create_locked, is_suffix, remove_files, remove_folder, unique_suffix};
 use crate::volume::{EntryKind, Lock, Volume};
 use std::ffi::OsStr;
+use std::io;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -38,6 +40,45 @@ impl ScratchDir {
         })
     }
 
+    /// The folder of the work that `key` stands for, with the runs that a killed process left in it, or an empty one.
+    /// While another process has it, a folder as [`Self::create`] makes.
+    ///
+    /// # Errors
+    /// As [`Self::create`].
+    pub fn create_or_adopt(volume: &Arc<dyn Volume>, parent: &Path, key: u64) -> Result<Self, StoreError> {
+        let path = parent.join(format!("{PREFIX}{key:016x}"));
+        match volume.create_dir(&path, SCRATCH_MODE) {
+            Ok(()) => {}
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(write_error(volume.as_ref(), "create folder", &path, 0, error)),
+        }
+        let locked = volume.try_lock(&path).and_then(|lock| Ok((lock, volume.kind(&path)?)));
+        match locked {
+            Ok((Some(lock), Some(_))) => Ok(Self {
+                volume: volume.clone(),
+                path,
+                _lock: lock,
+            }),
+            // Somebody else has it, or swept it in between.
+            Ok(_) => Self::create(volume, parent),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Self::create(volume, parent),
+            Err(error) => Err(StoreError::io("lock scratch", &path, error)),
+        }
+    }
+
+    /// The sealed runs in it, numbered from 0 without a gap, each with what its writer noted. Every other file goes.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`] if the folder cannot be cleaned.
+    pub fn sealed_runs(&self) -> Result<Vec<(Run, Vec<u8>)>, StoreError> {
+        let runs: Vec<_> = (0..).map_while(|number| Run::reopen(self, number)).collect();
+        let keep: Vec<_> = runs.iter().flat_map(|(run, _)| run.names()).collect();
+        let other = |name: &OsStr| is_run_name(name) && !keep.contains(&self.path.join(name));
+        let cleaned = remove_files(self.volume.as_ref(), &self.path, &other);
+        cleaned.map_err(|error| StoreError::io("clean scratch", &self.path, error))?;
+        Ok(runs)
+    }
+
     /// The folder.
     pub fn path(&self) -> &Path {
         &self.path
@@ -65,16 +106,19 @@ impl Drop for ScratchDir {
     }
 }
 
-/// What a sweep removed.
+/// What a sweep did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sweep {
-    /// Folders.
+    /// Folders removed.
     pub folders: usize,
-    /// Bytes of the files in them.
+    /// Bytes removed.
     pub bytes: u64,
+    /// Folders that stay because a build can go on from the runs in them.
+    pub kept: usize,
 }
 
-/// Removes the scratch folders of dead processes in `parent`: our pattern, not locked, nothing else in them.
+/// Removes the scratch folders of dead processes in `parent`: our pattern, not locked, nothing else in them. Folders with
+/// sealed runs stay for [`RUNS_KEPT`]: the build that is submitted again goes on from them.
 ///
 /// # Errors
 /// [`StoreError::Io`] if `parent` cannot be listed; folders that resist are skipped.
@@ -88,13 +132,23 @@ pub fn sweep_scratch(volume: &dyn Volume, parent: &Path) -> Result<Sweep, StoreE
         if entry.kind == EntryKind::Folder
             && is_scratch_name(&entry.name)
             && let Ok(Some(_lock)) = volume.try_lock(&path)
-            && let Ok(bytes) = remove_folder(volume, &path, &is_run_name)
         {
-            sweep.folders += 1;
-            sweep.bytes += bytes;
+            if is_resumable(volume, &path) {
+                sweep.kept += 1;
+            } else if let Ok(bytes) = remove_folder(volume, &path, &is_run_name) {
+                sweep.folders += 1;
+                sweep.bytes += bytes;
+            }
         }
     }
     Ok(sweep)
+}
+
+fn is_resumable(volume: &dyn Volume, path: &Path) -> bool {
+    let sealed = || Ok(volume.list(path)?.iter().any(|entry| is_seal_name(&entry.name)));
+    let young = || Ok(volume.age(path)? < RUNS_KEPT);
+    let holds = |answer: io::Result<bool>| answer.unwrap_or(false);
+    holds(sealed()) && holds(young())
 }
 
 fn is_scratch_name(name: &OsStr) -> bool {

@@ -167,6 +167,13 @@ pub(crate) fn remove_temporary(volume: &dyn Volume, path: &Path) -> io::Result<(
 
 /// Removes a folder and the files in it that `ours` knows; one with other content stays. Returns the bytes freed.
 pub(crate) fn remove_folder(volume: &dyn Volume, path: &Path, ours: &dyn Fn(&OsStr) -> bool) -> io::Result<u64> {
+    let freed = remove_files(volume, path, ours)?;
+    gone_is_fine(retry(|| volume.remove_dir(path)))?;
+    Ok(freed)
+}
+
+/// Removes the files in a folder that `ours` knows. Returns the bytes freed.
+pub(crate) fn remove_files(volume: &dyn Volume, path: &Path, ours: &dyn Fn(&OsStr) -> bool) -> io::Result<u64> {
     let mut freed = 0;
     for entry in retry(|| volume.list(path))? {
         if entry.kind == EntryKind::File && ours(&entry.name) {
@@ -176,7 +183,6 @@ pub(crate) fn remove_folder(volume: &dyn Volume, path: &Path, ours: &dyn Fn(&OsS
             freed += bytes;
         }
     }
-    gone_is_fine(retry(|| volume.remove_dir(path)))?;
     Ok(freed)
 }
 

@@ -7,6 +7,7 @@ use std::any::Any;
 use std::ffi::OsString;
 use std::io;
 use std::path::Path;
+use std::time::Duration;
 
 /// The bytes of one open file.
 pub trait Storage: Send + Sync {
@@ -134,6 +135,12 @@ pub trait Volume: Send + Sync {
     /// # Errors
     /// As the system says.
     fn free_bytes(&self, dir: &Path) -> io::Result<u64>;
+
+    /// Time since the folder last changed: since a name was made or removed in it.
+    ///
+    /// # Errors
+    /// As the system says.
+    fn age(&self, dir: &Path) -> io::Result<Duration>;
 
     /// Marks a file or folder as in use by a living process; `None` if another one has it.
     ///

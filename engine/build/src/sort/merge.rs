@@ -20,9 +20,9 @@ pub struct Merge {
     quantizer: Quantizer,
 }
 
-/// A run and the part of it in memory. The reader goes, and with it the file, as soon as the run has ended.
+/// A run and the part of it in memory. The file stays until the merge goes: should this process die, the next one needs it.
 struct Cursor {
-    reader: Option<RunReader>,
+    reader: RunReader,
     buffer: Vec<PointRecord>,
     next: usize,
 }
@@ -30,15 +30,9 @@ struct Cursor {
 impl Cursor {
     /// Makes sure that `buffer[next]` is the next point; `None` at the end.
     fn front(&mut self) -> Result<Option<&PointRecord>, StoreError> {
-        if self.next == self.buffer.len()
-            && let Some(reader) = &mut self.reader
-        {
+        if self.next == self.buffer.len() {
             self.next = 0;
-            reader.next_records(&mut self.buffer)?;
-            if self.buffer.is_empty() {
-                self.reader = None;
-                self.buffer = Vec::new();
-            }
+            self.reader.next_records(&mut self.buffer)?;
         }
         Ok(self.buffer.get(self.next))
     }
@@ -59,7 +53,7 @@ impl Merge {
         };
         for (index, run) in runs.into_iter().enumerate() {
             merge.runs.push(Cursor {
-                reader: Some(RunReader::new(run, blocks_per_read)),
+                reader: RunReader::new(run, blocks_per_read),
                 buffer: Vec::new(),
                 next: 0,
             });

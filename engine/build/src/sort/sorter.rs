@@ -24,6 +24,10 @@ pub struct Sorter {
     budget: Budget,
     /// Points that the input says it has.
     expected: u64,
+    /// Names the scratch folder, where runs may outlive this process.
+    input_key: Option<u64>,
+    /// Points at the start of the input that are in runs already.
+    resumed: u64,
     traffic: Traffic,
 }
 
@@ -68,6 +72,8 @@ pub struct Traffic {
     pub bytes_read: u64,
     /// Time spent sorting runs and writing them.
     pub spill_seconds: f64,
+    /// Runs that were there already.
+    pub runs_resumed: u64,
 }
 
 /// All points, ready to be read in order.
@@ -83,7 +89,7 @@ pub type Watch<'a> = &'a mut dyn FnMut(u64) -> Result<(), BuildError>;
 
 impl Sorter {
     /// An empty sorter; scratch is touched by the first spill.
-    pub fn new(volume: &Arc<dyn Volume>, scratch_dir: &Path, budget: Budget) -> Self {
+    pub fn new(volume: &Arc<dyn Volume>, scratch_dir: &Path, input_key: Option<u64>, budget: Budget) -> Self {
         Self {
             buffer: PointBuffer::new(budget.core_points),
             spilling: Spilling::default(),
@@ -93,6 +99,8 @@ impl Sorter {
             scratch_dir: scratch_dir.to_owned(),
             budget,
             expected: 0,
+            input_key,
+            resumed: 0,
             traffic: Traffic::default(),
         }
     }
@@ -109,6 +117,24 @@ impl Sorter {
     /// Whether the points are expected to need no runs.
     pub fn fits_core(&self) -> bool {
         self.expected <= self.budget.core_points as u64
+    }
+
+    /// Takes over the runs that a killed build of the same input left, if they were sorted by the same lattice; returns how
+    /// many points they hold: the first ones of the input.
+    ///
+    /// # Errors
+    /// Those of scratch.
+    pub fn resume(&mut self, quantizer: &Quantizer) -> Result<u64, StoreError> {
+        let Some(key) = self.input_key else { return Ok(0) };
+        let scratch = ScratchDir::create_or_adopt(&self.volume, &self.scratch_dir, key)?;
+        let note = note(quantizer);
+        let runs = scratch.sealed_runs()?.into_iter();
+        self.runs = runs.map_while(|(run, its)| (its == note).then_some(run)).collect();
+        self.scratch = Some(Arc::new(scratch));
+        self.traffic.runs = self.runs.len() as u64;
+        self.traffic.runs_resumed = self.traffic.runs;
+        self.resumed = self.runs.iter().map(Run::records).sum();
+        Ok(self.resumed)
     }
 
     /// Threads to work with.
@@ -148,7 +174,8 @@ impl Sorter {
         let (scratch, quantizer, threads) = (scratch.clone(), *quantizer, self.threads());
         let number = self.traffic.runs;
         self.traffic.runs += 1;
-        let spill = move || write_run(&scratch, number, full, &quantizer, threads);
+        let seal = self.input_key.map(|_| note(&quantizer));
+        let spill = move || write_run(&scratch, number, full, &quantizer, threads, seal.as_deref());
         let thread = Builder::new().name("pbgi-sort".to_owned()).spawn(spill);
         self.spilling.0 = Some(thread.map_err(BuildError::Thread)?);
         if oversized {
@@ -170,7 +197,7 @@ impl Sorter {
 
     /// Whether something was spilled.
     pub fn has_runs(&self) -> bool {
-        self.scratch.is_some()
+        self.traffic.runs > 0
     }
 
     /// Ends: spills what is left if there are runs, and merges runs until the last merge can take them all.
@@ -215,6 +242,12 @@ impl Sorter {
     }
 }
 
+/// What a seal says of the order of its run.
+fn note(quantizer: &Quantizer) -> Vec<u8> {
+    let [x, y, z] = quantizer.origin;
+    [x, y, z, quantizer.edge].map(f64::to_le_bytes).concat()
+}
+
 /// Sorts a buffer and writes it as run `number`.
 fn write_run(
     scratch: &ScratchDir,
@@ -222,6 +255,7 @@ fn write_run(
     mut buffer: PointBuffer,
     quantizer: &Quantizer,
     threads: usize,
+    seal: Option<&[u8]>,
 ) -> Result<Spilled, StoreError> {
     let started = Instant::now();
     let order = buffer.sorted(quantizer, threads);
@@ -229,7 +263,10 @@ fn write_run(
     for point in order.iter(&buffer) {
         writer.push(point)?;
     }
-    let run = writer.finish()?;
+    let run = match seal {
+        Some(note) => writer.finish_sealed(note)?,
+        None => writer.finish()?,
+    };
     buffer.clear();
     Ok(Spilled {
         run,

@@ -203,6 +203,9 @@ fn a_disk_without_room_is_refused_before_runs_are_written() {
         fn free_bytes(&self, _dir: &Path) -> std::io::Result<u64> {
             Ok(20_000)
         }
+        fn age(&self, dir: &Path) -> std::io::Result<std::time::Duration> {
+            self.0.age(dir)
+        }
         fn try_lock(&self, path: &Path) -> std::io::Result<Option<pbgi_store::volume::Lock>> {
             self.0.try_lock(path)
         }
@@ -225,6 +228,7 @@ fn a_disk_without_room_is_refused_before_runs_are_written() {
 
 const ABORT_AT: &str = "PBGI_TEST_ABORT_AT";
 const ABORT_IN: &str = "PBGI_TEST_ABORT_IN";
+const ABORT_KEY: &str = "PBGI_TEST_ABORT_KEY";
 
 /// Not a promise by itself: the process that the next test kills.
 #[test]
@@ -240,8 +244,62 @@ fn killed_build_child() {
         }
         ControlFlow::Continue(())
     };
-    let host = busy_host(&place.volume);
-    pbgi_build::build_on(&mut cloud(), &place.request(small_pages()), &host, &mut observer).unwrap();
+    let mut host = busy_host(&place.volume);
+    let mut request = place.request(small_pages());
+    if let Ok(key) = std::env::var(ABORT_KEY) {
+        // One merge of all runs: intermediate merges use them up.
+        host.fan_in_max = usize::MAX;
+        request.input_key = Some(key.parse().unwrap());
+    }
+    pbgi_build::build_on(&mut cloud(), &request, &host, &mut observer).unwrap();
+}
+
+/// Runs that process to its observer's call `at`; whether it was killed there.
+fn killed_at(at: u32, place: &Place, key: Option<u64>) -> bool {
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command
+        .args(["--exact", "failures::killed_build_child", "--quiet"])
+        .env(ABORT_AT, at.to_string())
+        .env(ABORT_IN, place.root())
+        .stdout(std::process::Stdio::null());
+    if let Some(key) = key {
+        command.env(ABORT_KEY, key.to_string());
+    }
+    !command.status().unwrap().success()
+}
+
+#[test]
+fn a_killed_build_goes_on_from_its_finished_runs_to_the_same_bytes() {
+    let bytes =
+        |place: &Place| ["nodes.pages", "points.pages"].map(|name| std::fs::read(place.output().join(name)).unwrap());
+    let undisturbed = Place::on_disk();
+    build_cloud(&cloud(), &undisturbed, &busy_host(&undisturbed.volume), small_pages()).unwrap();
+    let (mut kills, mut resumed) = (0, 0);
+    for at in 1.. {
+        let place = Place::on_disk();
+        if !killed_at(at, &place, Some(7)) {
+            break;
+        }
+        kills += 1;
+        let swept = sweep_scratch(&OsVolume, &place.scratch()).unwrap();
+        sweep_temporaries(&OsVolume, &place.output()).unwrap();
+        let mut host = busy_host(&place.volume);
+        host.fan_in_max = usize::MAX;
+        let mut request = place.request(small_pages());
+        // Another input gets nothing of it.
+        request.input_key = Some(8);
+        let other = pbgi_build::build_on(&mut cloud(), &request, &host, &mut |_| ControlFlow::Continue(())).unwrap();
+        assert_eq!(other.runs_resumed, 0, "killed at {at}");
+        request.input_key = Some(7);
+        let report = pbgi_build::build_on(&mut cloud(), &request, &host, &mut |_| ControlFlow::Continue(())).unwrap();
+        assert_eq!(report.runs, 5);
+        assert_eq!(report.runs_resumed > 0, swept.kept > 0, "killed at {at}");
+        resumed += report.runs_resumed;
+        assert!(bytes(&place) == bytes(&undisturbed), "killed at {at}");
+        Tree::audit(&place.open().unwrap(), &cloud().points);
+        assert!(place.leftovers(&OsVolume).is_empty(), "killed at {at}");
+    }
+    assert!(kills >= 5 && resumed >= 10, "{kills} kills, {resumed} runs resumed");
 }
 
 #[test]
@@ -249,14 +307,7 @@ fn a_killed_build_leaves_no_scene_and_its_scratch_is_swept() {
     let place = Place::on_disk();
     let (mut kills, mut swept_bytes) = (0, 0);
     for at in (1..).step_by(2) {
-        let status = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "failures::killed_build_child", "--quiet"])
-            .env(ABORT_AT, at.to_string())
-            .env(ABORT_IN, place.root())
-            .stdout(std::process::Stdio::null())
-            .status()
-            .unwrap();
-        if status.success() {
+        if !killed_at(at, &place, None) {
             break;
         }
         kills += 1;

@@ -60,14 +60,21 @@ fn peak_memory() -> u64 {
     line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
 }
 
+/// Bytes that this process has read and written so far, as the system counts them.
+fn transferred() -> (u64, u64) {
+    let text = std::fs::read_to_string("/proc/self/io").unwrap();
+    let count = |name| text.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+    (count("rchar: ").parse().unwrap(), count("wchar: ").parse().unwrap())
+}
+
 #[test]
-fn a_build_three_times_its_memory_stays_within_it() {
+fn a_build_three_times_its_memory_stays_within_it_and_moves_no_byte_twice() {
     if std::env::var_os(CHILD).is_none() {
         // In a process of its own: other tests run beside this one.
         let status = Command::new(std::env::current_exe().unwrap())
             .args([
                 "--exact",
-                "memory::a_build_three_times_its_memory_stays_within_it",
+                "memory::a_build_three_times_its_memory_stays_within_it_and_moves_no_byte_twice",
                 "--nocapture",
             ])
             .env(CHILD, "1")
@@ -79,7 +86,9 @@ fn a_build_three_times_its_memory_stays_within_it() {
     let place = Place::on_disk();
     let mut request = place.request(BuildSettings::default());
     request.memory_bytes = LIMIT;
+    let before = transferred();
     let report = build(&mut Endless { next: 0 }, &request, &mut |_| ControlFlow::Continue(())).unwrap();
+    let after = transferred();
     let peak = peak_memory();
     eprintln!(
         "peak memory {} of {LIMIT} bytes, {} runs, {:?}",
@@ -88,6 +97,21 @@ fn a_build_three_times_its_memory_stays_within_it() {
     assert_eq!(report.info.point_count, POINTS);
     assert!(report.runs >= 6);
     assert!(peak <= LIMIT, "peak memory {peak} of {LIMIT} bytes");
+    // Runs are written and read once, the scene is written once, and the report says so.
+    let (read, written) = (after.0 - before.0, after.1 - before.1);
+    assert!(
+        read >= report.bytes_read && read * 20 <= report.bytes_read * 21,
+        "{read} bytes read"
+    );
+    assert!(
+        written >= report.bytes_written && written * 20 <= report.bytes_written * 21,
+        "{written} bytes written"
+    );
+    assert_eq!(report.bytes_read, POINTS * 32);
+    let scene_bytes = std::fs::read_dir(place.output())
+        .unwrap()
+        .map(|entry| entry.unwrap().metadata().unwrap().len());
+    assert_eq!(report.bytes_written, POINTS * 32 + scene_bytes.sum::<u64>());
     let scene = place.open().unwrap();
     scene.verify().unwrap();
 }

@@ -83,6 +83,42 @@ fn flat_and_linear_clouds_and_any_scale_build() {
 }
 
 #[test]
+fn coordinates_and_radii_of_any_size_make_finite_nodes() {
+    let radii = [f32::MIN_POSITIVE / 16.0, 1e-30, 1e-3, 1.0, 1e15, 1e30, f32::MAX];
+    for scale in [f32::MIN_POSITIVE / 16.0, 1e-30, 1.0, 1e30, f32::MAX] {
+        let points = sheet(300).into_iter().enumerate().map(|(i, mut point)| {
+            point.position = point.position.map(|value| value / 10.0 * scale);
+            point.radius = radii[i % radii.len()];
+            point
+        });
+        build_and_audit(&Cloud::new(points.collect()), small_pages());
+        for radius in radii {
+            let tiny = sheet(100)
+                .into_iter()
+                .map(|point| pbgi_core::PointRecord { radius, ..point });
+            build_and_audit(&Cloud::new(tiny.collect()), small_pages());
+        }
+    }
+}
+
+#[test]
+fn one_octant_and_a_speck_far_away_are_built_in_any_order() {
+    // Everything in one corner of the root: the order in which a sort by octants has the least to do.
+    let mut points: Vec<_> = sheet(20_000)
+        .into_iter()
+        .map(|mut point| {
+            point.position = point.position.map(|value| value * 1e-4);
+            point
+        })
+        .collect();
+    points.insert(7, point([1000.0; 3]));
+    let (tree, _) = build_and_audit(&Cloud::new(points.clone()), small_pages());
+    points.reverse();
+    let (reversed, _) = build_and_audit(&Cloud::new(points), small_pages());
+    assert_eq!(tree.levels, reversed.levels);
+}
+
+#[test]
 fn every_chunk_size_and_page_size_gives_the_same_tree() {
     let cloud = Cloud::new(sheet(20_000));
     let mut shapes = Vec::new();

@@ -169,6 +169,7 @@ impl Place {
             scratch_dir: self.scratch(),
             memory_bytes: 256_000_000,
             settings,
+            input_key: None,
         }
     }
 
@@ -280,6 +281,12 @@ impl Tree {
         let node = self.nodes[index.0 as usize];
         assert_eq!(node.level(), voxel.level);
         self.levels[voxel.level as usize] += 1;
+        let numbers = node.centroid.into_iter().chain(node.covariance.map(f32::from));
+        let mut numbers = numbers.chain(node.sh.into_iter().flatten().map(f32::from));
+        assert!(
+            numbers.all(f32::is_finite) && node.axis().is_finite(),
+            "{voxel:?} has numbers that are none: {node:?}"
+        );
         let sum = match node.kind() {
             NodeKind::Inner { first, mask } => self.check_children(first, mask, voxel),
             NodeKind::Leaf { first, count } => {

@@ -7,6 +7,7 @@ use std::ffi::{OsStr, OsString};
 use std::io;
 use std::path::{Component, Path};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 /// Granularity at which an unsynced write may be lost.
 const SECTOR: usize = 4096;
@@ -406,6 +407,10 @@ impl Volume for CrashVolume {
 
     fn free_bytes(&self, _dir: &Path) -> io::Result<u64> {
         Ok(u64::MAX)
+    }
+
+    fn age(&self, _dir: &Path) -> io::Result<Duration> {
+        Ok(Duration::ZERO)
     }
 
     fn try_lock(&self, path: &Path) -> io::Result<Option<Lock>> {

@@ -6,6 +6,7 @@ use std::io;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
 
 /// Which operations are counted and may fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -179,6 +180,11 @@ impl Volume for FaultVolume {
     fn free_bytes(&self, dir: &Path) -> io::Result<u64> {
         self.check(FaultScope::All)?;
         self.inner.free_bytes(dir)
+    }
+
+    fn age(&self, dir: &Path) -> io::Result<Duration> {
+        self.check(FaultScope::All)?;
+        self.inner.age(dir)
     }
 
     fn try_lock(&self, path: &Path) -> io::Result<Option<Lock>> {
