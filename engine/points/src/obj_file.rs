@@ -81,10 +81,7 @@ pub(crate) fn read(path: &Path) -> Result<SceneParts, PointsError> {
         world.append(path, &piece, &DAffine3::IDENTITY)?;
     }
     parts.geometries.push(world);
-    parts.instances.push(Instance {
-        geometry: 0,
-        world_from_local: DAffine3::IDENTITY,
-    });
+    parts.instances.push(Instance::new(0, &DAffine3::IDENTITY));
     Ok(parts)
 }
 

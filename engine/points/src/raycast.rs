@@ -49,13 +49,13 @@ impl MeshScene {
     fn radiance_along(&self, ray: &Ray) -> Option<Vec3> {
         let (surface, distance) = self.closest(ray)?;
         let instance = &self.instances[surface.instance as usize];
-        let geometry = &self.geometries[instance.geometry];
+        let geometry = &self.geometries[instance.geometry()];
         let corners = instance.corners(geometry, surface.triangle as usize);
         let winding = area_vector(&corners).normalize_or_zero().as_vec3();
         let front = if instance.mirrors() { -winding } else { winding };
         let from_front = front.dot(ray.direction) < 0.0;
         let side = if from_front { front } else { -front };
-        let look = self.appearance(instance.geometry, surface.triangle as usize, surface.barycentric);
+        let look = self.appearance(instance.geometry(), surface.triangle as usize, surface.barycentric);
         let irradiance = self.direct_one_side(ray.origin + ray.direction * distance, side, side);
         let emission = if from_front || look.double_sided {
             look.emission

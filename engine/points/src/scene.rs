@@ -40,11 +40,12 @@ pub(crate) struct Geometry {
     pub(crate) charts: Charts,
 }
 
-/// A geometry placed in the world.
+/// A geometry placed in the world: 52 bytes, for there may be millions.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Instance {
-    pub(crate) geometry: usize,
-    pub(crate) world_from_local: DAffine3,
+    geometry: u32,
+    /// Columns of the matrix, then the translation.
+    world_from_local: [f32; 12],
 }
 
 /// A triangle's corner weights for its second and third corner.
@@ -140,7 +141,7 @@ impl MeshScene {
         let mut bounds = Bounds::EMPTY;
         let mut area = 0.0;
         for instance in &parts.instances {
-            let geometry = &parts.geometries[instance.geometry];
+            let geometry = &parts.geometries[instance.geometry()];
             for triangle in 0..geometry.triangles.len() {
                 let corners = instance.corners(geometry, triangle);
                 corners
@@ -175,14 +176,14 @@ impl MeshScene {
 
     /// Triangles, placed ones counted each time.
     pub fn triangle_count(&self) -> u64 {
-        let count = |instance: &Instance| self.geometries[instance.geometry].triangles.len() as u64;
+        let count = |instance: &Instance| self.geometries[instance.geometry()].triangles.len() as u64;
         self.instances.iter().map(count).sum()
     }
 
     /// Corners of all triangles in the world, placed ones each time.
     pub(crate) fn placed_triangles(&self) -> impl Iterator<Item = [DVec3; 3]> + '_ {
         self.instances.iter().flat_map(|instance| {
-            let geometry = &self.geometries[instance.geometry];
+            let geometry = &self.geometries[instance.geometry()];
             (0..geometry.triangles.len()).map(|triangle| instance.corners(geometry, triangle))
         })
     }
@@ -294,7 +295,7 @@ impl SceneParts {
                 .for_each(|material| *material += materials as u32);
         }
         for instance in &mut other.instances {
-            instance.geometry += geometries;
+            instance.geometry += geometries as u32;
         }
         for material in &mut other.materials {
             let slots = [&mut material.albedo_texture, &mut material.emission_texture];
@@ -310,7 +311,7 @@ impl SceneParts {
 
     /// What no later code looks at again: there are triangles, and every placed vertex is a finite f32.
     fn check(&self, path: &Path) -> Result<(), PointsError> {
-        let placed = |instance: &Instance| self.geometries[instance.geometry].triangles.len();
+        let placed = |instance: &Instance| self.geometries[instance.geometry()].triangles.len();
         let triangles: usize = self.instances.iter().map(placed).sum();
         if triangles == 0 {
             let what =
@@ -326,9 +327,9 @@ impl SceneParts {
             });
         }
         for instance in &self.instances {
-            for (index, &position) in self.geometries[instance.geometry].positions.iter().enumerate() {
+            for (index, &position) in self.geometries[instance.geometry()].positions.iter().enumerate() {
                 let world = instance
-                    .world_from_local
+                    .world_from_local()
                     .transform_point3(Vec3::from(position).as_dvec3());
                 if !world.as_vec3().is_finite() {
                     let what = format!("vertex {index} is not finite in world space: {position:?}");
@@ -367,16 +368,32 @@ impl Geometry {
 }
 
 impl Instance {
+    pub(crate) fn new(geometry: usize, world_from_local: &DAffine3) -> Self {
+        Self {
+            geometry: geometry as u32,
+            world_from_local: world_from_local.to_cols_array().map(|value| value as f32),
+        }
+    }
+
+    pub(crate) fn geometry(&self) -> usize {
+        self.geometry as usize
+    }
+
+    pub(crate) fn world_from_local(&self) -> DAffine3 {
+        DAffine3::from_cols_array(&self.world_from_local.map(f64::from))
+    }
+
     /// Corner positions in the world.
     pub(crate) fn corners(&self, geometry: &Geometry, triangle: usize) -> [DVec3; 3] {
+        let world_from_local = self.world_from_local();
         geometry
             .corners(triangle)
-            .map(|corner| self.world_from_local.transform_point3(corner.as_dvec3()))
+            .map(|corner| world_from_local.transform_point3(corner.as_dvec3()))
     }
 
     /// Whether it mirrors: the front of its triangles is then on the other side of their winding.
     pub(crate) fn mirrors(&self) -> bool {
-        self.world_from_local.matrix3.determinant() < 0.0
+        self.world_from_local().matrix3.determinant() < 0.0
     }
 }
 

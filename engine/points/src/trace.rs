@@ -20,7 +20,6 @@ pub(crate) struct Ray {
 /// The BVHs of a scene.
 pub(crate) struct Tracer {
     geometries: Vec<TriangleBvh>,
-    instances: Vec<Placed>,
     /// Over the instances' boxes.
     top: CwBvh,
 }
@@ -39,12 +38,6 @@ struct Triangle {
     edge2: [f32; 3],
 }
 
-struct Placed {
-    geometry: usize,
-    /// `None` where local space is world space.
-    local_from_world: Option<DAffine3>,
-}
-
 struct Boxed(Aabb);
 
 impl Boundable for Boxed {
@@ -55,29 +48,20 @@ impl Boundable for Boxed {
 
 impl Tracer {
     pub(crate) fn new(geometries: &[Geometry], instances: &[Instance]) -> Self {
-        let mut boxes = Vec::with_capacity(instances.len());
-        let mut placed = Vec::with_capacity(instances.len());
-        for instance in instances {
-            let geometry = &geometries[instance.geometry];
+        let boxed = |instance: &Instance| {
+            let world_from_local = instance.world_from_local();
             let mut aabb = Aabb::empty();
-            for position in &geometry.positions {
-                let world = instance
-                    .world_from_local
-                    .transform_point3(Vec3::from(*position).as_dvec3());
+            for position in &geometries[instance.geometry()].positions {
+                let world = world_from_local.transform_point3(Vec3::from(*position).as_dvec3());
                 aabb.extend(Vec3A::from(world.as_vec3()));
             }
             // The ray is moved to local space with roundings of its own: let it in a little early.
             let slack = Vec3A::splat(aabb.min.abs().max(aabb.max.abs()).max_element() * 1e-5);
-            boxes.push(Boxed(Aabb::new(aabb.min - slack, aabb.max + slack)));
-            let is_world = instance.world_from_local == DAffine3::IDENTITY;
-            placed.push(Placed {
-                geometry: instance.geometry,
-                local_from_world: (!is_world).then(|| instance.world_from_local.inverse()),
-            });
-        }
+            Boxed(Aabb::new(aabb.min - slack, aabb.max + slack))
+        };
+        let boxes: Vec<Boxed> = instances.iter().map(boxed).collect();
         Self {
             geometries: geometries.iter().map(TriangleBvh::new).collect(),
-            instances: placed,
             top: build(&boxes),
         }
     }
@@ -168,12 +152,14 @@ impl Triangle {
     }
 }
 
-impl Placed {
+impl Instance {
     /// The ray in local space, its direction again of unit length, and the length of a world unit there.
-    fn to_local(&self, ray: &Ray) -> (Ray, f32) {
-        let Some(transform) = &self.local_from_world else {
+    fn to_local(self, ray: &Ray) -> (Ray, f32) {
+        let world_from_local = self.world_from_local();
+        if world_from_local == DAffine3::IDENTITY {
             return (*ray, 1.0);
-        };
+        }
+        let transform = world_from_local.inverse();
         let direction = transform.transform_vector3(ray.direction.as_dvec3());
         let length = direction.length();
         let local = Ray {
@@ -190,12 +176,12 @@ impl MeshScene {
         let tracer = self.tracer();
         let mut best: Option<(SurfaceId, f32)> = None;
         let mut visit = |index: usize, limit: f32| {
-            let placed = &tracer.instances[index];
+            let placed = &self.instances[index];
             let (local, scale) = placed.to_local(ray);
-            let geometry = &tracer.geometries[placed.geometry];
+            let geometry = &tracer.geometries[placed.geometry()];
             let triangle = |slot: usize| geometry.bvh.primitive_indices[slot];
             let found = geometry.closest(&local, limit * scale, |slot, barycentric| {
-                self.is_opaque(placed.geometry, triangle(slot) as usize, barycentric)
+                self.is_opaque(placed.geometry(), triangle(slot) as usize, barycentric)
             });
             let Some((slot, barycentric, t)) = found else {
                 return f32::INFINITY;
@@ -208,7 +194,7 @@ impl MeshScene {
             best = Some((surface, t / scale));
             t / scale
         };
-        if tracer.instances.len() == 1 {
+        if self.instances.len() == 1 {
             visit(0, f32::INFINITY);
         } else {
             let mut hit = RayHit::none();
@@ -224,15 +210,15 @@ impl MeshScene {
     pub(crate) fn occluded(&self, ray: &Ray, limit: f32) -> bool {
         let tracer = self.tracer();
         let visit = |index: usize| {
-            let placed = &tracer.instances[index];
+            let placed = &self.instances[index];
             let (local, scale) = placed.to_local(ray);
-            let geometry = &tracer.geometries[placed.geometry];
+            let geometry = &tracer.geometries[placed.geometry()];
             geometry.occluded(&local, limit * scale, |slot, barycentric| {
                 let triangle = geometry.bvh.primitive_indices[slot] as usize;
-                self.is_opaque(placed.geometry, triangle, barycentric)
+                self.is_opaque(placed.geometry(), triangle, barycentric)
             })
         };
-        if tracer.instances.len() == 1 {
+        if self.instances.len() == 1 {
             return visit(0);
         }
         let top = &tracer.top;

@@ -345,3 +345,54 @@ fn invalid_points_are_counted_and_refused_or_skipped() {
         stream.rewind().unwrap();
     }
 }
+
+#[test]
+fn a_length_or_count_that_is_wrong_is_refused_naming_both() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("records.ply");
+    let mut writer = PlyWriter::create(&path, PlyForm::Records, &[]).unwrap();
+    (0..100).for_each(|index| writer.push(&point(index), &[]).unwrap());
+    writer.finish().unwrap();
+    let whole = fs::read(&path).unwrap();
+    for change in 1..=32 {
+        let shorter = whole.len() - change * 7;
+        fs::write(&path, &whole[..shorter]).unwrap();
+        assert_says(
+            read(&path, &InputOptions::default()).map(drop),
+            &[
+                "truncated",
+                &whole.len().to_string(),
+                &shorter.to_string(),
+                "records.ply",
+            ],
+        );
+        let longer = whole.len() + change * 7;
+        fs::write(&path, [&whole[..], &vec![0; change * 7]].concat()).unwrap();
+        assert_says(
+            read(&path, &InputOptions::default()).map(drop),
+            &[
+                "count is wrong",
+                &whole.len().to_string(),
+                &longer.to_string(),
+                "records.ply",
+            ],
+        );
+    }
+}
+
+#[test]
+fn a_point_outside_the_declared_box_is_refused_with_count_or_measured() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = las(folder.path(), "box.las", 0.0, 255);
+    let mut bytes = fs::read(&path).unwrap();
+    // The header's largest x, at its place in every version of the format.
+    bytes[179..187].copy_from_slice(&0.0005f64.to_le_bytes());
+    fs::write(&path, &bytes).unwrap();
+    assert_says(
+        read(&path, &bare()).map(drop),
+        &["380 points lie outside the box", "--recompute-bounds"],
+    );
+    let mut options = bare();
+    options.cloud.recompute_bounds = true;
+    assert_eq!(read(&path, &options).unwrap().len(), 400);
+}

@@ -82,7 +82,9 @@ fn bad_light_probes_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("probe.exr");
     assert_says(read_environment(&path), &["cannot open", "probe.exr"]);
-    assert_says(read_environment(Path::new("a.tiff")), &["\"tiff\"", "convert"]);
+    let other = folder.path().join("a.tiff");
+    std::fs::write(&other, b"II*\0").unwrap();
+    assert_says(read_environment(&other), &["unknown kind", "convert", "a.tiff"]);
     let mut image = LayeredImage::new(4, 2);
     image.add("Y", Precision::Float, vec![1.0; 8]);
     image.write_exr(&path).unwrap();
@@ -102,7 +104,7 @@ fn bad_light_probes_are_named() {
     let hdr = folder.path().join("probe.hdr");
     fs::write(&hdr, b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 100000\n").unwrap();
     assert_says(read_environment(&hdr), &["number of pixels", "probe.hdr"]);
-    fs::write(&hdr, b"not a picture").unwrap();
+    fs::write(&hdr, b"#?not a picture").unwrap();
     assert_says(read_environment(&hdr), &["not a usable HDR", "probe.hdr"]);
 }
 

@@ -241,10 +241,6 @@ impl PointStream for LasPoints {
 }
 
 impl Cloud for LasPoints {
-    fn path(&self) -> &Path {
-        &self.path
-    }
-
     fn missing(&self) -> Missing {
         Missing {
             normals: true,

@@ -70,8 +70,6 @@ pub(crate) struct Missing {
 
 /// A cloud file. A point that lacks its normal or radius has [`NORMAL_PLACEHOLDER`] or [`RADIUS_PLACEHOLDER`] there.
 pub(crate) trait Cloud: PointStream<Error = PointsError> + Send {
-    fn path(&self) -> &Path;
-
     /// The same for all points of a file.
     fn missing(&self) -> Missing;
 

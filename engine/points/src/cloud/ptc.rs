@@ -255,10 +255,6 @@ impl PointStream for PtcPoints {
 }
 
 impl Cloud for PtcPoints {
-    fn path(&self) -> &Path {
-        &self.path
-    }
-
     fn missing(&self) -> Missing {
         Missing::default()
     }

@@ -4,11 +4,10 @@ use super::{Cloud, CloudOptions, Door, Missing, relative};
 use crate::error::PointsError;
 use pbgi_core::{Bounds, PageKind, PageNo, PointRecord, PointStream};
 use pbgi_store::Scene;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// A scene as a stream of points, in the order of its file.
 pub(crate) struct ScenePoints {
-    path: PathBuf,
     scene: Scene,
     page: Vec<PointRecord>,
     next: u64,
@@ -23,7 +22,6 @@ impl ScenePoints {
         Ok(Self {
             page: vec![bytemuck::Zeroable::zeroed(); info.settings.points_per_page as usize],
             door: Door::new(path, info.point_count, options.invalid_points),
-            path: path.to_owned(),
             scene,
             next: 0,
             origin,
@@ -76,10 +74,6 @@ impl PointStream for ScenePoints {
 }
 
 impl Cloud for ScenePoints {
-    fn path(&self) -> &Path {
-        &self.path
-    }
-
     fn missing(&self) -> Missing {
         Missing::default()
     }

@@ -45,6 +45,14 @@ pub(crate) struct Estimated {
     memory_bytes: u64,
     scratch_dir: PathBuf,
     stage: Stage,
+    outside: Outside,
+}
+
+/// Points outside of the box that the headers declare.
+#[derive(Clone, Copy, Debug, Default)]
+struct Outside {
+    count: u64,
+    first: Option<[f32; 3]>,
 }
 
 /// What is estimated, and how.
@@ -123,6 +131,7 @@ impl Estimated {
             threads: means.threads.max(1),
             memory_bytes: means.memory_bytes,
             scratch_dir: means.scratch_dir.to_owned(),
+            outside: Outside::default(),
         })
     }
 
@@ -347,27 +356,34 @@ impl Stage {
 }
 
 /// The next batch of the cloud at `current`, or of those after it; `false` at the end of all.
-fn read(
-    clouds: &mut [Box<dyn Cloud>],
-    current: &mut usize,
-    bounds: &Bounds,
-    batch: &mut Vec<PointRecord>,
-) -> Result<bool, PointsError> {
+fn read(clouds: &mut [Box<dyn Cloud>], current: &mut usize, batch: &mut Vec<PointRecord>) -> Result<bool, PointsError> {
     while let Some(cloud) = clouds.get_mut(*current) {
-        batch.clear();
         if cloud.next_batch(batch)? {
-            if let Some(outside) = batch.iter().find(|point| !bounds.contains(point.position)) {
-                let what = format!(
-                    "a point lies outside the box that the header declares, at {:?}: give --recompute-bounds",
-                    outside.position
-                );
-                return Err(PointsError::invalid(cloud.path(), what));
-            }
             return Ok(true);
         }
         *current += 1;
     }
     Ok(false)
+}
+
+impl Outside {
+    fn look(&mut self, points: &[PointRecord], bounds: &Bounds) {
+        for point in points.iter().filter(|point| !bounds.contains(point.position)) {
+            self.count += 1;
+            self.first.get_or_insert(point.position);
+        }
+    }
+
+    fn check(&self) -> Result<(), PointsError> {
+        match self.first {
+            None => Ok(()),
+            Some(first) => Err(PointsError::Request(format!(
+                "{} points lie outside the box that their headers declare, the first at {first:?}; give \
+                 --recompute-bounds",
+                self.count
+            ))),
+        }
+    }
 }
 
 impl PointStream for Estimated {
@@ -386,16 +402,18 @@ impl PointStream for Estimated {
         let mut points = Vec::new();
         self.stage = match std::mem::replace(&mut self.stage, Stage::Broken) {
             Stage::Counting(mut census, mut current) => {
-                if read(&mut self.clouds, &mut current, &self.wanted.bounds, &mut points)? {
+                if read(&mut self.clouds, &mut current, &mut points)? {
+                    self.outside.look(&points, &self.wanted.bounds);
                     census.add(&points);
                     Stage::Counting(census, current)
                 } else {
+                    self.outside.check()?;
                     self.clouds.iter_mut().try_for_each(|cloud| cloud.rewind())?;
                     Stage::Dealing(Box::new(census.deal(&self.scratch_dir, self.memory_bytes)?), 0)
                 }
             }
             Stage::Dealing(mut dealer, mut current) => {
-                if read(&mut self.clouds, &mut current, &self.wanted.bounds, &mut points)? {
+                if read(&mut self.clouds, &mut current, &mut points)? {
                     dealer.add(&points)?;
                     Stage::Dealing(dealer, current)
                 } else {
@@ -439,6 +457,7 @@ impl PointStream for Estimated {
             }
             stage => {
                 *stage = Stage::start(&self.wanted.bounds);
+                self.outside = Outside::default();
                 self.clouds.iter_mut().try_for_each(|cloud| cloud.rewind())
             }
         }

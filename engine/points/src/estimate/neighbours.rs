@@ -65,11 +65,27 @@ impl<'a> Neighbours<'a> {
     /// that come first in the search.
     pub(super) fn nearest<const K: usize>(&self, of: usize) -> Nearest<K> {
         let mut nearest = Nearest {
-            found: [(f32::INFINITY, 0); K],
+            found: [(self.bound::<K>(of), 0); K],
             len: 0,
         };
         self.visit(self.levels.len() - 1, 0, of, &mut nearest);
         nearest
+    }
+
+    /// A squared distance within which there are `K` others, from the points beside it in the order.
+    fn bound<const K: usize>(&self, of: usize) -> f32 {
+        let from = self.positions[of];
+        let first = of.saturating_sub(K);
+        let end = (of + K + 1).min(self.positions.len());
+        let mut beside = Nearest::<K> {
+            found: [(f32::INFINITY, 0); K],
+            len: 0,
+        };
+        for other in (first..end).filter(|&other| other != of) {
+            beside.offer(self.positions[other].distance_squared(from), other as u32);
+        }
+        // Those at this very distance are to be found again.
+        beside.limit().next_up()
     }
 
     fn visit<const K: usize>(&self, level: usize, index: usize, of: usize, nearest: &mut Nearest<K>) {

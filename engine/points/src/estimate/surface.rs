@@ -28,7 +28,7 @@ pub(super) fn least_spread(points: impl Iterator<Item = Vec3> + Clone, around: V
 fn least_eigenvector(matrix: DMat3) -> DVec3 {
     /// A 3 x 3 matrix is diagonal to double precision after five or six.
     const SWEEPS: usize = 8;
-    const DONE: f64 = 1e-15;
+    const DONE: f64 = 1e-12;
     let mut a = matrix.to_cols_array_2d();
     let mut v = DMat3::IDENTITY.to_cols_array_2d();
     for _ in 0..SWEEPS {

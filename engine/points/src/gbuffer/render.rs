@@ -87,7 +87,7 @@ impl MeshScene {
             return Pixel::default();
         };
         let instance = &self.instances[surface.instance as usize];
-        let geometry = &self.geometries[instance.geometry];
+        let geometry = &self.geometries[instance.geometry()];
         let corners = instance.corners(geometry, surface.triangle as usize);
         let [v, w] = surface.barycentric.map(f64::from);
         let position = (corners[0] * (1.0 - v - w) + corners[1] * v + corners[2] * w).as_vec3();
@@ -96,7 +96,7 @@ impl MeshScene {
         let seen_from_front = front.dot(ray.direction) < 0.0;
         let geometric = if seen_from_front { front } else { -front };
         let shading = self.shading_normal(&surface, geometric);
-        let look = self.appearance(instance.geometry, surface.triangle as usize, surface.barycentric);
+        let look = self.appearance(instance.geometry(), surface.triangle as usize, surface.barycentric);
         Pixel {
             position,
             normal: shading,
@@ -114,10 +114,10 @@ impl MeshScene {
     /// The interpolated normal on the side of `geometric`, or `geometric` itself where there is none to be trusted.
     fn shading_normal(&self, surface: &SurfaceId, geometric: Vec3) -> Vec3 {
         let instance = &self.instances[surface.instance as usize];
-        let geometry = &self.geometries[instance.geometry];
+        let geometry = &self.geometries[instance.geometry()];
         let local = geometry.vertex_normal(surface.triangle as usize, surface.barycentric);
         let world = local.and_then(|local| {
-            let matrix = instance.world_from_local.matrix3;
+            let matrix = instance.world_from_local().matrix3;
             let turned = if matrix == DMat3::IDENTITY {
                 local.as_dvec3()
             } else {

@@ -54,19 +54,17 @@ pub(crate) fn read(path: &Path, fits: &dyn Fn(u64) -> Result<(), PointsError>) -
                 .try_for_each(|transform| world.append(path, &local, transform))?;
             continue;
         }
-        parts
-            .instances
-            .extend(transforms.iter().map(|&world_from_local| Instance {
-                geometry: parts.geometries.len(),
-                world_from_local,
-            }));
+        parts.instances.extend(
+            transforms
+                .iter()
+                .map(|place| Instance::new(parts.geometries.len(), place)),
+        );
         parts.geometries.push(local);
     }
     if !world.triangles.is_empty() {
-        parts.instances.push(Instance {
-            geometry: parts.geometries.len(),
-            world_from_local: DAffine3::IDENTITY,
-        });
+        parts
+            .instances
+            .push(Instance::new(parts.geometries.len(), &DAffine3::IDENTITY));
         parts.geometries.push(world);
     }
     Ok(parts)

@@ -311,10 +311,6 @@ impl PointStream for PlyPoints {
 }
 
 impl Cloud for PlyPoints {
-    fn path(&self) -> &Path {
-        &self.path
-    }
-
     fn missing(&self) -> Missing {
         match &self.form {
             Form::Records => Missing::default(),

@@ -123,7 +123,7 @@ impl Layout {
         let Some(instance) = scene.instances.get(self.instance) else {
             return false;
         };
-        let geometry = &scene.geometries[instance.geometry];
+        let geometry = &scene.geometries[instance.geometry()];
         if self.chart >= geometry.charts.len() {
             self.instance += 1;
             self.chart = 0;
@@ -165,7 +165,7 @@ impl Layout {
 
     /// The lattice of a chart that is large enough for one.
     fn plane_of(&self, scene: &MeshScene, instance: &Instance, triangles: &[u32]) -> Option<Plane> {
-        let geometry = &scene.geometries[instance.geometry];
+        let geometry = &scene.geometries[instance.geometry()];
         let points = |triangle: &u32| self.sizes.points_on(&instance.corners(geometry, *triangle as usize));
         if triangles.iter().map(points).sum::<f64>() < LATTICE_POINTS_MIN {
             return None;
@@ -209,7 +209,7 @@ impl Layout {
 impl Face {
     fn new(scene: &MeshScene, index: usize, triangle: u32) -> Self {
         let instance = &scene.instances[index];
-        let corners = instance.corners(&scene.geometries[instance.geometry], triangle as usize);
+        let corners = instance.corners(&scene.geometries[instance.geometry()], triangle as usize);
         let vector = area_vector(&corners);
         let front = if instance.mirrors() { -vector } else { vector };
         Self {

@@ -89,7 +89,7 @@ impl MeshPoints {
     fn light(&self, surfel: &Surfel) -> Result<Option<PointRecord>, InvalidPoint> {
         let scene = &self.scene;
         let surface = &surfel.surface;
-        let geometry = scene.instances[surface.instance as usize].geometry;
+        let geometry = scene.instances[surface.instance as usize].geometry();
         let (triangle, barycentric) = (surface.triangle as usize, surface.barycentric);
         if !scene.is_opaque(geometry, triangle, barycentric) {
             return Ok(None);
