@@ -5,12 +5,12 @@
 
 #![allow(clippy::unwrap_used, reason = "a benchmark asserts")]
 
-use nix::fcntl::{PosixFadviseAdvice, posix_fadvise};
 use pbgi_build::{BuildReport, BuildRequest, Stage, build};
 use pbgi_core::point::Sides;
 use pbgi_core::{Bounds, BuildSettings, PointRecord, PointStream};
 use pbgi_points::{InputOptions, PlyForm, PointsError, open_input, write_point_ply};
 use pbgi_store::Overwrite;
+use pbgi_tests::forget;
 use std::fs::{self, File};
 use std::io::{Read, Write};
 use std::ops::ControlFlow;
@@ -113,13 +113,6 @@ fn bytes(text: &str) -> u64 {
         _ => 1,
     };
     digits.parse::<u64>().unwrap() * unit
-}
-
-/// Makes the next read of the file come from the disk.
-fn forget(path: &Path) {
-    let file = File::open(path).unwrap();
-    file.sync_all().unwrap();
-    posix_fadvise(&file, 0, 0, PosixFadviseAdvice::POSIX_FADV_DONTNEED).unwrap();
 }
 
 /// Seconds to read the whole file, front to back.

@@ -10,10 +10,12 @@
     reason = "a harness fails by panicking"
 )]
 
+mod disk;
 mod house;
 mod picture;
 mod scene;
 
+pub use disk::forget;
 pub use house::{DAEMON, House, Job, Run, program, signal, wait_for, workspace_root};
 pub use nix::sys::signal::Signal;
 pub use picture::{Picture, assert_same, assert_same_values, relative_rms, rms};
