@@ -12,7 +12,8 @@ use pbgi_proto::v1::scene_service_client::SceneServiceClient;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::net::UnixStream;
-use tonic::transport::{Channel, Endpoint};
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 use tonic::{Code, Request, Status};
 
 /// Until the daemon accepts a connection.
@@ -30,7 +31,8 @@ const RESPONSE_BYTES_MAX: usize = 32 << 20;
 #[derive(Clone, Debug)]
 pub struct Client {
     channel: Channel,
-    socket: PathBuf,
+    address: String,
+    token: Option<MetadataValue<Ascii>>,
 }
 
 impl Client {
@@ -68,13 +70,69 @@ impl Client {
             .map_err(|error| unreachable(chain(&error)))?;
         Ok(Self {
             channel,
-            socket: socket.to_owned(),
+            address: format!("unix:{}", socket.display()),
+            token: None,
         })
     }
 
-    /// The socket this client is connected to.
-    pub fn socket(&self) -> &Path {
-        &self.socket
+    /// Connects to a daemon on another machine, `https://host:port`, by mutual TLS. `identity` is a folder with `ca.pem`, who
+    /// signed the daemon's certificate; `cert.pem` and `key.pem`, who we are; and `token`, if the daemon wants one.
+    ///
+    /// # Errors
+    /// A file that is missing or unusable, another address, or nobody who listens there and knows us.
+    pub async fn connect_remote(uri: &str, identity: &Path) -> Result<Self, ClientError> {
+        let read = |name: &str| {
+            let path = identity.join(name);
+            std::fs::read_to_string(&path).map_err(|source| ClientError::Io {
+                action: "read",
+                path,
+                source,
+            })
+        };
+        let unreachable = |reason: String| ClientError::Connect {
+            path: PathBuf::from(uri),
+            reason,
+        };
+        let tls = ClientTlsConfig::new()
+            .ca_certificate(Certificate::from_pem(read("ca.pem")?))
+            .identity(Identity::from_pem(read("cert.pem")?, read("key.pem")?));
+        let token = match read("token") {
+            Ok(token) => {
+                let header = format!("Bearer {}", token.trim()).parse::<MetadataValue<Ascii>>();
+                Some(header.map_err(|_| unreachable("the token is no plain text".to_owned()))?)
+            }
+            Err(ClientError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => None,
+            Err(error) => return Err(error),
+        };
+        let endpoint = Endpoint::from_shared(uri.to_owned()).map_err(|_| ClientError::Address(uri.to_owned()))?;
+        let channel = endpoint
+            .connect_timeout(Duration::from_secs(CONNECT_SECS))
+            .tls_config(tls)
+            .map_err(|error| unreachable(chain(&error)))?
+            .connect()
+            .await
+            .map_err(|error| unreachable(chain(&error)))?;
+        Ok(Self {
+            channel,
+            address: uri.to_owned(),
+            token,
+        })
+    }
+
+    /// Where this client is connected to.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    fn request<T>(&self, wish: &Wish, message: T) -> Request<T> {
+        self.sign(wish.request(message))
+    }
+
+    fn sign<T>(&self, mut request: Request<T>) -> Request<T> {
+        if let Some(token) = &self.token {
+            request.metadata_mut().insert("authorization", token.clone());
+        }
+        request
     }
 
     /// Submits a build under the caller's `id`; the same id with the same request is the same job.
@@ -113,7 +171,7 @@ impl Client {
             options: Some(convert::job_options(options)),
             attach: options.attach,
         };
-        let answer = self.jobs().submit_job(wish.request(request)).await;
+        let answer = self.jobs().submit_job(self.request(&wish, request)).await;
         wish.job(answer)
     }
 
@@ -124,7 +182,7 @@ impl Client {
     pub async fn job(&self, id: &str) -> Result<Job, ClientError> {
         let wish = Wish::new(format!("look up job {id:?}"), REQUEST_SECS);
         let request = v1::GetJobRequest { job_id: id.to_owned() };
-        let answer = self.jobs().get_job(wish.request(request)).await;
+        let answer = self.jobs().get_job(self.request(&wish, request)).await;
         wish.job(answer)
     }
 
@@ -139,7 +197,7 @@ impl Client {
             cancel_on_disconnect: false,
         };
         // No deadline: a job may take days.
-        let answer = self.jobs().watch_job(Request::new(request)).await;
+        let answer = self.jobs().watch_job(self.sign(Request::new(request))).await;
         let mut stream = answer.map_err(|status| wish.failed(&status))?.into_inner();
         loop {
             let message = stream.message().await.map_err(|status| wish.failed(&status))?;
@@ -162,7 +220,7 @@ impl Client {
         let wish = Wish::new(format!("cancel job {id:?}"), REQUEST_SECS);
         let (job_id, reason) = (id.to_owned(), reason.to_owned());
         let request = v1::CancelJobRequest { job_id, reason };
-        let answer = self.jobs().cancel_job(wish.request(request)).await;
+        let answer = self.jobs().cancel_job(self.request(&wish, request)).await;
         wish.job(answer)
     }
 
@@ -174,7 +232,7 @@ impl Client {
         let wish = Wish::new(format!("pause job {id:?}"), REQUEST_SECS);
         let (job_id, reason) = (id.to_owned(), reason.to_owned());
         let request = v1::PauseJobRequest { job_id, reason };
-        let answer = self.jobs().pause_job(wish.request(request)).await;
+        let answer = self.jobs().pause_job(self.request(&wish, request)).await;
         wish.job(answer)
     }
 
@@ -185,7 +243,7 @@ impl Client {
     pub async fn resume(&self, id: &str) -> Result<Job, ClientError> {
         let wish = Wish::new(format!("resume job {id:?}"), REQUEST_SECS);
         let request = v1::ResumeJobRequest { job_id: id.to_owned() };
-        let answer = self.jobs().resume_job(wish.request(request)).await;
+        let answer = self.jobs().resume_job(self.request(&wish, request)).await;
         wish.job(answer)
     }
 
@@ -196,7 +254,7 @@ impl Client {
     pub async fn retry(&self, id: &str) -> Result<Job, ClientError> {
         let wish = Wish::new(format!("retry job {id:?}"), REQUEST_SECS);
         let request = v1::RetryJobRequest { job_id: id.to_owned() };
-        let answer = self.jobs().retry_job(wish.request(request)).await;
+        let answer = self.jobs().retry_job(self.request(&wish, request)).await;
         wish.job(answer)
     }
 
@@ -208,7 +266,7 @@ impl Client {
         let wish = Wish::new("list the jobs", REQUEST_SECS);
         let answer = self
             .jobs()
-            .list_jobs(wish.request(v1::ListJobsRequest::default()))
+            .list_jobs(self.request(&wish, v1::ListJobsRequest::default()))
             .await;
         let list = answer.map_err(|status| wish.failed(&status))?.into_inner();
         let jobs = list.jobs.into_iter().map(convert::job).collect::<Result<_, _>>();
@@ -227,7 +285,7 @@ impl Client {
             message,
         })?;
         let answer = SceneServiceClient::new(self.channel.clone())
-            .get_scene(wish.request(v1::GetSceneRequest { scene }))
+            .get_scene(self.request(&wish, v1::GetSceneRequest { scene }))
             .await;
         let info = answer.map_err(|status| wish.failed(&status))?.into_inner();
         convert::scene_info(&info).map_err(|fault| wish.malformed(fault))
@@ -239,7 +297,10 @@ impl Client {
     /// A lost connection.
     pub async fn status(&self) -> Result<DaemonStatus, ClientError> {
         let wish = Wish::new("ask for the daemon's status", REQUEST_SECS);
-        let answer = self.daemon().get_status(wish.request(v1::GetStatusRequest {})).await;
+        let answer = self
+            .daemon()
+            .get_status(self.request(&wish, v1::GetStatusRequest {}))
+            .await;
         let status = answer.map_err(|status| wish.failed(&status))?.into_inner();
         Ok(convert::daemon_status(status))
     }
@@ -250,7 +311,10 @@ impl Client {
     /// A refusal, or a lost connection.
     pub async fn shutdown(&self) -> Result<(), ClientError> {
         let wish = Wish::new("shut the daemon down", SHUTDOWN_SECS);
-        let answer = self.daemon().shutdown(wish.request(v1::ShutdownRequest {})).await;
+        let answer = self
+            .daemon()
+            .shutdown(self.request(&wish, v1::ShutdownRequest {}))
+            .await;
         answer.map_err(|status| wish.failed(&status))?;
         Ok(())
     }

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 #[non_exhaustive]
 pub enum ClientError {
     /// The server's address has an unknown form.
-    #[error("server address {0:?} is not understood: write unix:/path/to/jobs.sock")]
+    #[error("server address {0:?} is not understood: write unix:/path/to/jobs.sock or https://host:port")]
     Address(String),
     /// Nobody listens on the socket.
     #[error("no daemon answers on {path:?}: {reason}")]

@@ -49,6 +49,7 @@ class Daemon:
         (self.folder / "in").mkdir()
         log = open(self.folder / "log", "w")
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log)
+        log.close()
         line = self.process.stdout.readline().decode().strip()
         assert line == "READY", line + (self.folder / "log").read_text()
 
@@ -204,6 +205,15 @@ class Tcp(unittest.TestCase):
             with self.assertRaises(pbgi.Error) as caught:
                 client.status()
             self.assertEqual(caught.exception.reason, "UNAUTHENTICATED")
+        # The command line finds the same files where it looks for them.
+        home = folder / "config/pbgi/tls"
+        home.mkdir(parents=True)
+        for name, ours in [("ca.pem", "ca.pem"), ("cert.pem", "cert"), ("key.pem", "key"), ("token", "token")]:
+            shutil.copy(folder / ours, home / name)
+        command = [BIN / "pbgi-client", "status", "--server", f"https://localhost:{port}"]
+        environment = {**os.environ, "XDG_CONFIG_HOME": str(folder / "config")}
+        told = subprocess.run(command, env=environment, capture_output=True, text=True)
+        self.assertIn(f"pid {daemon.process.pid}", told.stdout, told.stderr)
         daemon.stop()
         shutil.rmtree(folder)
 

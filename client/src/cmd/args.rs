@@ -14,7 +14,7 @@ use std::path::PathBuf;
 #[derive(Args, Debug, Default)]
 #[command(next_help_heading = "Daemon")]
 pub(crate) struct ServerArgs {
-    /// Use the daemon at this address, unix:/path/to/jobs.sock, instead of a private one
+    /// Use the daemon at this address, unix:/path/to/jobs.sock or https://host:port, instead of a private one
     #[arg(long, value_name = "URI")]
     pub(crate) server: Option<String>,
     /// Memory of the private daemon, all of its processes together: 2G, 512M

@@ -94,7 +94,7 @@ fn describe_daemon(client: &Client, status: &DaemonStatus) -> String {
     };
     let mut rows = vec![
         ("daemon", format!("pid {}, version {}", status.pid, status.version)),
-        ("address", format!("unix:{}", client.socket().display())),
+        ("address", client.address().to_owned()),
         (
             "memory",
             format!(
@@ -144,7 +144,7 @@ pub(crate) async fn shutdown(args: ShutdownArgs, interrupt: &Interrupt) -> Resul
         Ok(stopped)
     });
     for client in stopped.await? {
-        println!("the daemon at unix:{} is stopping", client.socket().display());
+        println!("the daemon at {} is stopping", client.address());
     }
     Ok(())
 }

@@ -7,6 +7,7 @@ use super::progress::Progress;
 use pbgi_client::private::{Folders, server_program};
 use pbgi_client::{BuildJob, Client, ClientError, Job, JobOptions, JobState, Refusal, ShadeJob};
 use pbgi_core::Statistics;
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// A cancelled job stops within one tile.
@@ -30,7 +31,7 @@ pub(crate) async fn connect(
     progress: &Progress,
 ) -> Result<Client, Failure> {
     if let Some(uri) = &server.server {
-        return interrupt.guard(async { Ok(Client::connect(uri).await?) }).await;
+        return interrupt.guard(named(uri)).await;
     }
     let own = std::env::current_exe();
     let own = own.map_err(|error| Failure::failed(format!("cannot tell where pbgi-client lies: {error}")))?;
@@ -44,10 +45,22 @@ pub(crate) async fn connect(
     Ok(client)
 }
 
+/// The daemon at an address that the user gave.
+async fn named(uri: &str) -> Result<Client, Failure> {
+    if !uri.starts_with("https://") {
+        return Ok(Client::connect(uri).await?);
+    }
+    let variable = |name, below: &str| std::env::var_os(name).map(|base| PathBuf::from(base).join(below));
+    let folder = variable("XDG_CONFIG_HOME", "pbgi/tls").or_else(|| variable("HOME", ".config/pbgi/tls"));
+    let folder =
+        folder.ok_or_else(|| Failure::failed("set HOME or XDG_CONFIG_HOME: certificates are in pbgi/tls there"))?;
+    Ok(Client::connect_remote(uri, &folder).await?)
+}
+
 /// The daemons that run now and that the options mean; at least one.
 pub(crate) async fn running(args: &RunningArgs) -> Result<Vec<Client>, Failure> {
     let clients = match &args.server {
-        Some(uri) => vec![Client::connect(uri).await?],
+        Some(uri) => vec![named(uri).await?],
         None => folders()?.running().await?,
     };
     if clients.is_empty() {

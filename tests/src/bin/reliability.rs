@@ -1,8 +1,9 @@
 //! Prints the reliability table: what may go wrong, what is promised, which test proves it, its number, and whether it is green.
 //!
-//!     cargo run -p pbgi-tests --bin reliability            the quick rows
-//!     cargo run -p pbgi-tests --bin reliability -- --slow  all, which takes many minutes; add --release to cargo for these
-//!     cargo run -p pbgi-tests --bin reliability -- P8 R6   these rows
+//!     cargo build --workspace --bins
+//!     target/debug/reliability           the quick rows
+//!     target/debug/reliability --slow    all, which takes many minutes
+//!     target/debug/reliability P8 R6     these rows
 //!
 //! Rows are in `tests/reliability.toml`. A test prints its number as a line `RELIABILITY ID: text`; one that prints none has its
 //! outcome for a number. Exits with 1 if a row is red.
@@ -90,9 +91,10 @@ fn name(proof: &Proof) -> String {
 
 fn run(proof: &Proof) -> Outcome {
     let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    // The whole workspace, so that what `cargo test --workspace` built is what runs.
     cargo
         .current_dir(workspace_root())
-        .args(["test", "--quiet", "--locked", "-p", &proof.package]);
+        .args(["test", "--workspace", "--quiet", "--locked"]);
     if !cfg!(debug_assertions) {
         cargo.arg("--release");
     }
