@@ -266,3 +266,40 @@ fn small_dev_shm_is_an_error_and_not_a_signal() {
         assert_empty(&house.path("out"));
     }
 }
+
+#[test]
+fn scans_without_normals_name_the_options_that_build_them() {
+    let house = house();
+    let mut text = "ply\nformat ascii 1.0\nelement vertex 900\n".to_owned();
+    for axis in ["x", "y", "z"] {
+        text += &format!("property double {axis}\n");
+    }
+    text += "end_header\n";
+    (0..900).for_each(|i| text += &format!("{} 0 {}\n", i % 30, i / 30));
+    fs::write(house.path("scan.ply"), text).unwrap();
+    let build = |options: &str| format!("build scan.ply -o out/a.pbgi {options} {DAEMON}");
+    refused(&house, &build(""), &["scan.ply", "no normals", "--estimate-normals"]);
+    refused(
+        &house,
+        &build("--estimate-normals"),
+        &["scan.ply", "no radius", "--radius auto"],
+    );
+    refused(
+        &house,
+        &build("--estimate-normals=sideways"),
+        &["up, out or a viewpoint"],
+    );
+    house
+        .line(&build("--estimate-normals=up --radius auto --stats scan.json"))
+        .ok();
+    let statistics: serde_json::Value = serde_json::from_slice(&fs::read(house.path("scan.json")).unwrap()).unwrap();
+    assert_eq!(
+        (&statistics["points"], &statistics["points_skipped"]),
+        (&900.into(), &0.into())
+    );
+    house
+        .line(&format!("build out/a.pbgi -o again.pbgi --leaf-max 4 {DAEMON}"))
+        .ok();
+    house.line("generate city --points 20000 -o city.ply").ok();
+    house.line(&format!("build city.ply -o city.pbgi {DAEMON}")).ok();
+}

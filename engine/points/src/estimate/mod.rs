@@ -425,7 +425,7 @@ impl PointStream for Estimated {
                 Stage::Sorting(dealer, bucket + 1)
             }
             Stage::Sorting(dealer, _) => Stage::Blocks {
-                ordered: Box::new(dealer.finish()?),
+                ordered: Box::new(dealer.finish()),
                 next: 0,
                 ready: Vec::new(),
             },

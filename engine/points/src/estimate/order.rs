@@ -2,7 +2,7 @@
 //! again.
 //!
 //! Points are counted by coarse cells, dealt out to buckets of consecutive cells that fit the memory, and each bucket is
-//! sorted by itself: the input is read twice, scratch is written twice and read once.
+//! sorted by itself: the input is read twice, scratch is written twice, and read once before the points are handed out.
 
 use crate::error::PointsError;
 use bytemuck::Zeroable;
@@ -43,7 +43,13 @@ pub(super) struct Dealer {
     waiting_max: usize,
     storage: Storage,
     bucket_points: u64,
-    memory_bytes: u64,
+    marks: Marks,
+}
+
+/// Codes of the finished order, one every `stride` points.
+struct Marks {
+    codes: Vec<u64>,
+    stride: u64,
 }
 
 struct Bucket {
@@ -57,9 +63,7 @@ struct Bucket {
 pub(super) struct Ordered {
     quantizer: Quantizer,
     storage: Storage,
-    /// Code of every `stride`th point.
-    index: Vec<u64>,
-    stride: u64,
+    marks: Marks,
     len: u64,
 }
 
@@ -120,7 +124,7 @@ impl Census {
             waiting_max: waiting_max.clamp(WAITING_MIN, 4096),
             storage,
             bucket_points,
-            memory_bytes,
+            marks: Marks::new(self.points, memory_bytes / 8),
         })
     }
 }
@@ -160,44 +164,50 @@ impl Dealer {
         let bucket = &mut self.buckets[bucket];
         bucket.flush(&mut self.storage)?;
         let range = bucket.range.clone();
-        sort_range(
-            &mut self.storage,
-            &self.quantizer,
-            range,
-            COUNT_LEVELS,
-            self.bucket_points,
-        )
+        let mut sort = Sort {
+            quantizer: &self.quantizer,
+            points_max: self.bucket_points,
+            marks: &mut self.marks,
+        };
+        sort.range(&mut self.storage, range, COUNT_LEVELS)
     }
 
     /// Once every bucket is sorted.
-    pub(super) fn finish(self) -> Result<Ordered, PointsError> {
-        let len = self.buckets.last().map_or(0, |bucket| bucket.range.end);
-        let entries = self.memory_bytes / 8 / size_of::<u64>() as u64;
-        let mut stride = INDEX_STRIDE_MIN;
-        while len / stride > entries.max(1) {
-            stride *= 2;
-        }
-        let mut ordered = Ordered {
+    pub(super) fn finish(self) -> Ordered {
+        Ordered {
             quantizer: self.quantizer,
             storage: self.storage,
-            index: Vec::with_capacity(len.div_ceil(stride) as usize),
-            stride,
-            len,
-        };
-        let mut points = Vec::new();
-        let chunk = stride * (READ_POINTS / stride).max(1);
-        for start in (0..len).step_by(chunk as usize) {
-            points.clear();
-            ordered.storage.read(start..(start + chunk).min(len), &mut points)?;
-            let marked = points.iter().step_by(stride as usize);
-            let codes = marked.map(|point| self.quantizer.code(point.position).0);
-            ordered.index.extend(codes);
+            marks: self.marks,
+            len: self.buckets.last().map_or(0, |bucket| bucket.range.end),
         }
-        Ok(ordered)
     }
 }
 
-/// Points read from scratch at once while the index is made or a region is counted.
+impl Marks {
+    fn new(points: u64, memory_bytes: u64) -> Self {
+        let most = memory_bytes / size_of::<u64>() as u64;
+        let mut stride = INDEX_STRIDE_MIN;
+        while points / stride > most.max(1) {
+            stride *= 2;
+        }
+        Self {
+            codes: vec![0; points.div_ceil(stride) as usize],
+            stride,
+        }
+    }
+
+    /// Notes the codes of points that are in their places, from `at` on.
+    fn note(&mut self, at: u64, points: &[PointRecord], quantizer: &Quantizer) {
+        let ahead = at.next_multiple_of(self.stride) - at;
+        let marked = points.iter().skip(ahead as usize).step_by(self.stride as usize);
+        let places = self.codes.iter_mut().skip(((at + ahead) / self.stride) as usize);
+        for (code, point) in places.zip(marked) {
+            *code = quantizer.code(point.position).0;
+        }
+    }
+}
+
+/// Points read from scratch at once while a range is counted or dealt out.
 const READ_POINTS: u64 = 1 << 14;
 
 impl Bucket {
@@ -219,26 +229,51 @@ impl Bucket {
     }
 }
 
-/// Sorts a range of records whose codes agree in the first `level` levels. What does not fit the memory is dealt out once
-/// more by the next levels; points of one code are in order already.
-fn sort_range(
+/// How ranges of records are sorted.
+struct Sort<'a> {
+    quantizer: &'a Quantizer,
+    points_max: u64,
+    marks: &'a mut Marks,
+}
+
+impl Sort<'_> {
+    /// Sorts a range of records whose codes agree in the first `level` levels. What does not fit the memory is dealt out
+    /// once more by the next levels; points of one code are in order already.
+    fn range(&mut self, storage: &mut Storage, range: Range<u64>, level: u32) -> Result<(), PointsError> {
+        let quantizer = self.quantizer;
+        if range.end - range.start <= self.points_max {
+            let mut points = Vec::with_capacity((range.end - range.start) as usize);
+            storage.read(range.clone(), &mut points)?;
+            // Stable: ties keep the order of the input.
+            points.sort_by_cached_key(|point| quantizer.code(point.position).0);
+            self.marks.note(range.start, &points, quantizer);
+            return storage.write(range.start, &points);
+        }
+        if level >= MORTON_BITS {
+            let mut at = range.start;
+            return storage.scan(range, &mut |points| {
+                self.marks.note(at, points, quantizer);
+                at += points.len() as u64;
+                Ok(())
+            });
+        }
+        let (cells, deeper) = deal_again(storage, quantizer, range.clone(), level)?;
+        for (_, range) in consecutive(&cells, self.points_max, range.start) {
+            self.range(storage, range, deeper)?;
+        }
+        Ok(())
+    }
+}
+
+/// Brings the records of a range into the order of their cells some levels further down; how many each cell has, and the
+/// level of those.
+fn deal_again(
     storage: &mut Storage,
     quantizer: &Quantizer,
     range: Range<u64>,
     level: u32,
-    points_max: u64,
-) -> Result<(), PointsError> {
+) -> Result<(Vec<u32>, u32), PointsError> {
     let count = range.end - range.start;
-    if count <= points_max {
-        let mut points = Vec::with_capacity(count as usize);
-        storage.read(range.clone(), &mut points)?;
-        // Stable: ties keep the order of the input.
-        points.sort_by_cached_key(|point| quantizer.code(point.position).0);
-        return storage.write(range.start, &points);
-    }
-    if level >= MORTON_BITS {
-        return Ok(());
-    }
     let deeper = (level + DEEPER_LEVELS).min(MORTON_BITS);
     let cell_of = |point: &PointRecord| {
         let below = quantizer.code(point.position).prefix(deeper);
@@ -274,11 +309,7 @@ fn sort_range(
         to += points.len() as u64;
         Ok(())
     })?;
-    drop(copy);
-    for (_, range) in consecutive(&cells, points_max, range.start) {
-        sort_range(storage, quantizer, range, deeper, points_max)?;
-    }
-    Ok(())
+    Ok((cells, deeper))
 }
 
 impl Storage {
@@ -375,10 +406,11 @@ impl Ordered {
     /// Records among which are all those whose code is in `codes`, and few others.
     pub(super) fn records_around(&self, codes: Range<u64>) -> Range<u64> {
         // The entry before the first one that is not below: points of the range may come before the next entry.
-        let first = self.index.partition_point(|&code| code < codes.start).saturating_sub(1) as u64;
-        let end = self.index.partition_point(|&code| code < codes.end) as u64;
-        let start = first * self.stride;
-        start..(end * self.stride).min(self.len).max(start)
+        let Marks { codes: marks, stride } = &self.marks;
+        let first = marks.partition_point(|&code| code < codes.start).saturating_sub(1) as u64;
+        let end = marks.partition_point(|&code| code < codes.end) as u64;
+        let start = first * stride;
+        start..(end * stride).min(self.len).max(start)
     }
 }
 
@@ -403,7 +435,7 @@ mod tests {
         let mut dealer = census.deal(folder.path(), memory_bytes).unwrap();
         points.chunks(100).for_each(|chunk| dealer.add(chunk).unwrap());
         (0..dealer.bucket_count()).for_each(|bucket| dealer.sort(bucket).unwrap());
-        let ordered = dealer.finish().unwrap();
+        let ordered = dealer.finish();
         let mut all = Vec::new();
         ordered.read(0..ordered.len(), &mut all).unwrap();
         assert_eq!(
