@@ -3,6 +3,7 @@
 use crate::convert;
 use crate::error::{ClientError, Refusal};
 use crate::job::{BuildJob, DaemonStatus, Job, JobOptions, ShadeJob};
+use crate::shape::SceneShape;
 use hyper_util::rt::TokioIo;
 use pbgi_core::SceneInfo;
 use pbgi_proto::v1;
@@ -289,6 +290,23 @@ impl Client {
             .await;
         let info = answer.map_err(|status| wish.failed(&status))?.into_inner();
         convert::scene_info(&info).map_err(|fault| wish.malformed(fault))
+    }
+
+    /// Counts the nodes of a scene by level.
+    ///
+    /// # Errors
+    /// As [`Self::scene`].
+    pub async fn scene_shape(&self, path: &Path) -> Result<SceneShape, ClientError> {
+        let wish = Wish::new(format!("look at the nodes of {path:?}"), SCENE_SECS);
+        let scene = convert::text(path).map_err(|message| ClientError::Refused {
+            action: wish.action.clone(),
+            refusal: Refusal::Invalid,
+            message,
+        })?;
+        let answer = SceneServiceClient::new(self.channel.clone())
+            .get_scene_shape(wish.request(v1::GetSceneRequest { scene }))
+            .await;
+        Ok(answer.map_err(|status| wish.failed(&status))?.into_inner().into())
     }
 
     /// The daemon's own account of itself.

@@ -10,9 +10,11 @@ mod convert;
 mod error;
 mod job;
 pub mod private;
+mod shape;
 pub mod size;
 
 pub use client::Client;
 pub use error::{ClientError, Refusal};
 pub use job::{BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
 pub use pbgi_points::{CloudOptions, Density};
+pub use shape::{LevelShape, SceneShape};

@@ -1,7 +1,7 @@
 //! The paper's experiments: Table 1 for procedural scenes, the ablation over chunk levels, the sweep over page sizes, and a
 //! view that touches a tenth of a scene against loading it whole.
 //!
-//! `cargo bench -p pbgi-tests --bench tables -- [--points 4000000] [--receivers 4096] [--memory 2G] [--kind city] [--dir DIR]`
+//! `cargo bench -p pbgi-tests --bench tables -- [--points 4000000] [--receivers 4096] [--memory 2G] [--kind city] [--table-only] [--dir DIR]`
 //!
 //! Receivers are points of the scene, in groups of 64 neighbours along the Z-curve, spread over all of it; one thread shades
 //! them through an LRU of pages.
@@ -150,6 +150,7 @@ struct Options {
     receivers: usize,
     memory: u64,
     kinds: Vec<Kind>,
+    table_only: bool,
     dir: PathBuf,
 }
 
@@ -159,6 +160,7 @@ fn options() -> Options {
         receivers: 4096,
         memory: 2 << 30,
         kinds: KINDS.to_vec(),
+        table_only: false,
         dir: std::env::temp_dir(),
     };
     let mut arguments = std::env::args().skip(1);
@@ -169,6 +171,7 @@ fn options() -> Options {
             "--receivers" => options.receivers = value().parse().unwrap(),
             "--memory" => options.memory = value().trim_end_matches('G').parse::<u64>().unwrap() << 30,
             "--kind" => options.kinds = vec![value().parse().unwrap()],
+            "--table-only" => options.table_only = true,
             "--dir" => options.dir = value().into(),
             // Said by cargo.
             "--bench" => {}
@@ -345,6 +348,9 @@ fn main() {
         }
     }
     bench.table(&columns);
+    if bench.options.table_only {
+        return;
+    }
     let input = last.unwrap();
     let default = BuildSettings::default();
     bench.tenth(&bench.build(&input, default).0);

@@ -9,7 +9,7 @@ use super::session;
 use super::summary::grouped;
 use clap::Args;
 use pbgi_client::size::format_bytes;
-use pbgi_client::{Client, DaemonStatus, Pool};
+use pbgi_client::{Client, DaemonStatus, LevelShape, Pool, SceneShape};
 use pbgi_core::{PageKind, SceneInfo};
 use std::path::PathBuf;
 
@@ -25,13 +25,14 @@ pub(crate) struct InfoArgs {
 
 pub(crate) async fn info(args: InfoArgs, interrupt: &Interrupt) -> Result<(), Failure> {
     let scene = files::input(&args.scene)?;
-    let info = {
+    let (info, shape) = {
         let mut progress = Progress::new();
         let client = session::connect(&args.server, interrupt, &progress).await?;
         progress.stage("verifying");
-        interrupt.guard(async { Ok(client.scene(&scene).await?) }).await?
+        let asked = async { Ok((client.scene(&scene).await?, client.scene_shape(&scene).await?)) };
+        interrupt.guard(asked).await?
     };
-    print!("{}", describe(&info));
+    print!("{}{}", describe(&info), histogram(&shape));
     Ok(())
 }
 
@@ -60,6 +61,40 @@ fn describe(info: &SceneInfo) -> String {
     rows.iter()
         .map(|(name, value)| format!("{name:14}  {value}\n"))
         .collect()
+}
+
+/// Nodes by level and leaves by how full they are, drawn in bars.
+fn histogram(shape: &SceneShape) -> String {
+    const BAR: u64 = 32;
+    let bar = |value: u64, most: u64| {
+        let length = (value * BAR).checked_div(most).unwrap_or(0);
+        // What is there is seen.
+        "#".repeat(length.max(u64::from(value > 0)) as usize)
+    };
+    let mut text = String::new();
+    if shape.levels.is_empty() {
+        return text;
+    }
+    let nodes = |level: &LevelShape| level.inner + level.leaves;
+    let most = shape.levels.iter().map(nodes).max().unwrap_or(0);
+    text += &format!(
+        "\n{:>5} {:>13} {:>13} {:>13}\n",
+        "level", "inner nodes", "leaves", "points"
+    );
+    for (number, level) in shape.levels.iter().enumerate() {
+        let (inner, leaves, points) = (grouped(level.inner), grouped(level.leaves), grouped(level.points));
+        text += &format!(
+            "{number:>5} {inner:>13} {leaves:>13} {points:>13}  {}\n",
+            bar(nodes(level), most)
+        );
+    }
+    let most = shape.occupancy.iter().copied().max().unwrap_or(0);
+    text += "\nleaves by how full they are\n";
+    for (bin, &leaves) in shape.occupancy.iter().enumerate() {
+        let full = format!("{:.0} %", (bin + 1) as f64 * 100.0 / shape.occupancy.len() as f64);
+        text += &format!("{:>5} {:>13}  {}\n", full, grouped(leaves), bar(leaves, most));
+    }
+    text
 }
 
 /// `status`
@@ -153,6 +188,29 @@ pub(crate) async fn shutdown(args: ShutdownArgs, interrupt: &Interrupt) -> Resul
 mod tests {
     use super::*;
     use pbgi_core::{BuildId, BuildSettings};
+
+    #[test]
+    fn a_tree_is_drawn_level_by_level() {
+        let level = |inner, leaves, points| LevelShape { inner, leaves, points };
+        let shape = SceneShape {
+            levels: vec![level(1, 0, 0), level(1, 7, 70), level(0, 8, 1234)],
+            occupancy: vec![1, 14],
+        };
+        let text = histogram(&shape);
+        assert!(
+            text.contains("    1             1             7            70  ################################\n"),
+            "{text}"
+        );
+        assert!(
+            text.contains("    0             1             0             0  ####\n"),
+            "{text}"
+        );
+        assert!(
+            text.contains(" 50 %             1  ##\n") && text.contains("1,234"),
+            "{text}"
+        );
+        assert_eq!(histogram(&SceneShape::default()), "");
+    }
 
     #[test]
     fn an_empty_scene_is_described() {

@@ -23,6 +23,7 @@ pub mod run;
 pub mod scene;
 pub mod scene_writer;
 pub mod scratch;
+pub mod shape;
 pub mod temporary;
 #[cfg(any(test, feature = "testsuite"))]
 pub mod testsuite;
@@ -40,5 +41,6 @@ pub use run::{Run, RunReader, RunWriter};
 pub use scene::Scene;
 pub use scene_writer::SceneWriter;
 pub use scratch::{ScratchDir, Sweep, sweep_scratch};
+pub use shape::{LevelShape, SceneShape};
 pub use temporary::sweep_temporaries;
 pub use volume::{EntryKind, RenameMode, Storage, Volume};

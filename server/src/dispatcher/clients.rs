@@ -11,6 +11,7 @@ use crate::scheduler::{DRAINING, Event, JobNo, Order};
 use crate::supervisor::WorkerBirth;
 use pbgi_cache::CacheCounters;
 use pbgi_core::{Environment, NodeRecord, PageKind, PageNo, PointRecord, SceneInfo, Statistics};
+use pbgi_store::SceneShape;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -344,6 +345,15 @@ impl Dispatcher {
         let opened = tokio::task::spawn_blocking(move || this.open_scene(&path)).await;
         let opened = opened.map_err(|error| JobError::new(JobErrorKind::Internal, error.to_string()))?;
         opened.map(|mounted| mounted.scene().info().clone())
+    }
+
+    /// Counts the nodes of a scene by level. Blocks.
+    ///
+    /// # Errors
+    /// As [`Self::open_scene`], and a node page that is damaged.
+    pub fn scene_shape(&self, path: &Path) -> Result<SceneShape, JobError> {
+        let shape = self.open_scene(path)?.scene().shape();
+        shape.map_err(|error| JobError::new(JobErrorKind::Corrupt, error.to_string()))
     }
 
     /// Opens and mounts a scene that a client names. Blocks.

@@ -7,6 +7,7 @@ use crate::shade_job::Counters;
 use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
 use pbgi_points::{CloudOptions, Facing, InvalidPoints, Radius, ViewDensity};
 use pbgi_proto::v1;
+use pbgi_store::{LevelShape, SceneShape};
 
 pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Request, JobError> {
     match task {
@@ -147,6 +148,18 @@ fn statistics(statistics: &Statistics) -> v1::Statistics {
     let rows = statistics.rows().into_iter();
     v1::Statistics {
         rows: rows.filter_map(|row| Some((row.name.to_owned(), row.value?))).collect(),
+    }
+}
+
+pub(super) fn shape(shape: &SceneShape) -> v1::SceneShape {
+    let level = |level: &LevelShape| v1::LevelShape {
+        inner: level.inner,
+        leaves: level.leaves,
+        points: level.points,
+    };
+    v1::SceneShape {
+        levels: shape.levels.iter().map(level).collect(),
+        occupancy: shape.occupancy.to_vec(),
     }
 }
 

@@ -150,6 +150,14 @@ impl SceneService for Jobs {
         Ok(Response::new(convert::scene(&info)))
     }
 
+    async fn get_scene_shape(&self, request: Request<v1::GetSceneRequest>) -> Result<Response<v1::SceneShape>, Status> {
+        let (this, path) = (self.dispatcher.clone(), request.into_inner().scene);
+        let shape = blocking(move || this.scene_shape(path.as_ref()))
+            .await
+            .map_err(status)?;
+        Ok(Response::new(convert::shape(&shape)))
+    }
+
     async fn warm_scene(
         &self,
         request: Request<v1::WarmSceneRequest>,

@@ -262,6 +262,17 @@ impl Tree {
         }
         assert_eq!(tree.next_point, info.point_count);
         assert_eq!(tree.seen.len() as u64, info.node_count);
+        let shape = scene.shape().unwrap();
+        let counted = shape.levels.iter().map(|level| level.inner + level.leaves);
+        let levels = tree.levels[..shape.levels.len()].iter().copied();
+        assert!(counted.eq(levels) && tree.levels[shape.levels.len()..].iter().all(|&nodes| nodes == 0));
+        assert_eq!(
+            shape.levels.iter().map(|level| level.points).sum::<u64>(),
+            info.point_count
+        );
+        let overflow_leaves =
+            shape.levels.iter().map(|level| level.leaves).sum::<u64>() - shape.occupancy.iter().sum::<u64>();
+        assert_eq!(overflow_leaves > 0, tree.overflow_points > 0);
         let padding = (0..info.node_slots as u32).filter(|slot| !tree.seen.contains(slot));
         let zero = NodeRecord::zeroed();
         padding.for_each(|slot| assert!(tree.nodes[slot as usize] == zero, "padding slot {slot} is not zero"));
