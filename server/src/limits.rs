@@ -94,6 +94,8 @@ pub const PARK_DEATHS: usize = 5;
 pub const PARK_WINDOW: Duration = Duration::from_secs(10);
 /// How long the supervisor sleeps at most while it has children: the fallback for a death that closed no descriptor.
 pub const REAP_POLL: Duration = Duration::from_millis(50);
+/// How long a worker whose page channel closed may take to end before SIGKILL.
+pub const HANGUP_GRACE: Duration = Duration::from_millis(100);
 /// How long a process may take to end after SIGTERM before SIGKILL.
 pub const TERM_GRACE: Duration = Duration::from_secs(2);
 /// Commands the supervisor may be behind.

@@ -13,6 +13,13 @@ fn parse(status: &str) -> Option<u64> {
     Some(kilobytes << 10)
 }
 
+/// Processes that the kernel has killed for want of memory since it started; `None` where it does not count them.
+pub fn oom_kills() -> Option<u64> {
+    let counters = fs::read_to_string("/proc/vmstat").ok()?;
+    let count = counters.lines().find_map(|line| line.strip_prefix("oom_kill "))?;
+    count.trim().parse().ok()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -516,7 +516,7 @@ impl Scheduler {
         let revoked = self.leases.get(&id).is_some_and(|lease| lease.revoked);
         let Some((number, tile)) = self.release(id) else { return };
         effects.push(Effect::Wake);
-        // A tile that ran out of time is as suspect as one that crashed; other kills are not its doing.
+        // A tile that ran out of time is as suspect as one that crashed; kills by others are not its doing.
         if (revoked || death == Death::Own)
             && let Some(job) = self.jobs.get_mut(&number)
         {

@@ -236,10 +236,14 @@ impl<N: Nursery + 'static> Supervisor<N> {
                     slot.ready(seat);
                 }
             }
-            Command::Kill(seat) | Command::Hangup(seat) => {
-                let own = matches!(command, Command::Hangup(_));
+            Command::Kill(seat) => {
                 if let Some(slot) = self.slots.get_mut(usize::from(seat.slot)) {
-                    slot.kill(seat, own);
+                    slot.kill(seat);
+                }
+            }
+            Command::Hangup(seat) => {
+                if let Some(slot) = self.slots.get_mut(usize::from(seat.slot)) {
+                    slot.hung_up(seat, Instant::now());
                 }
             }
             Command::Build(order) => self.builds.start(&self.plan, order),

@@ -165,10 +165,12 @@ pub enum Event {
 /// Whose doing a worker's death was.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Death {
-    /// Its own.
+    /// Its own, or that of the kernel when memory ran out.
     Own,
     /// The daemon's.
     Killed,
+    /// Somebody else's, by a signal: it says nothing about the tile.
+    Outside,
 }
 
 /// Something to do.

@@ -147,13 +147,13 @@ fn poison_tile_fails_its_job_at_the_third_death() {
 }
 
 #[test]
-fn kills_for_other_reasons_do_not_poison_a_tile() {
+fn kills_by_others_do_not_poison_a_tile() {
     let (mut scheduler, now) = shading(1);
     for epoch in 1..20 {
         grant(&mut scheduler, seat(0, epoch), now).unwrap();
         let gone = Event::WorkerGone {
             seat: seat(0, epoch),
-            death: Death::Killed,
+            death: if epoch % 2 == 0 { Death::Killed } else { Death::Outside },
         };
         assert_eq!(scheduler.on(gone, now), [Effect::Wake]);
     }

@@ -3,12 +3,15 @@
 use super::children::exempt_daemon;
 use super::{Nursery, Plan, WorkerBirth, kill_now};
 use crate::limits;
+use crate::memory;
 use crate::scheduler::{Death, Seat};
+use nix::sys::signal::Signal;
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
+use std::os::unix::process::ExitStatusExt;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
@@ -40,6 +43,36 @@ struct Worker {
     child: Child,
     ready: bool,
     killed: bool,
+    /// Its page channel closed: when it is killed unless it has ended by then.
+    kill_at: Option<Instant>,
+    /// It was killed for that.
+    useless: bool,
+    /// Processes that the kernel had killed for want of memory when this one started.
+    oom_kills: Option<u64>,
+}
+
+impl Worker {
+    /// Whose doing its end was. A signal from outside is told from one that the worker earned: faults raise others, and the
+    /// kernel counts the processes that it kills for want of memory.
+    fn death(&self, status: Option<ExitStatus>) -> Death {
+        const SENT: [i32; 5] = [
+            Signal::SIGKILL as i32,
+            Signal::SIGTERM as i32,
+            Signal::SIGINT as i32,
+            Signal::SIGHUP as i32,
+            Signal::SIGQUIT as i32,
+        ];
+        let sent = status
+            .and_then(|status| status.signal())
+            .is_some_and(|signal| SENT.contains(&signal));
+        // Where the kernel does not count, nothing is known: the tile stays a suspect.
+        let out_of_memory = self.oom_kills.is_none() || self.oom_kills != memory::oom_kills();
+        match (self.killed, sent && !self.useless && !out_of_memory) {
+            (true, _) => Death::Killed,
+            (false, true) => Death::Outside,
+            (false, false) => Death::Own,
+        }
+    }
 }
 
 impl Slot {
@@ -89,35 +122,45 @@ impl Slot {
         }
     }
 
-    /// Kills whoever sits in `seat`. A worker that closed its channel is dead or useless: its own doing.
-    pub(super) fn kill(&mut self, seat: Seat, own: bool) {
+    /// Kills whoever sits in `seat`.
+    pub(super) fn kill(&mut self, seat: Seat) {
         if let State::Taken { worker } = &mut self.state
             && worker.seat == seat
         {
-            if !own {
-                worker.killed = true;
-                tracing::warn!(
-                    slot = seat.slot,
-                    epoch = seat.epoch,
-                    pid = worker.child.id(),
-                    "killing worker"
-                );
-            }
+            worker.killed = true;
+            tracing::warn!(
+                slot = seat.slot,
+                epoch = seat.epoch,
+                pid = worker.child.id(),
+                "killing worker"
+            );
             kill_now(worker.child.id());
+        }
+    }
+
+    /// A worker that closed its channel is dead or useless. It gets a moment, so that a dead one's status tells why.
+    pub(super) fn hung_up(&mut self, seat: Seat, now: Instant) {
+        if let State::Taken { worker } = &mut self.state
+            && worker.seat == seat
+        {
+            worker.kill_at.get_or_insert(now + limits::HANGUP_GRACE);
         }
     }
 
     pub(super) fn spawn(&mut self, plan: &Plan, nursery: &mut impl Nursery, now: Instant) {
         let seat = nursery.seat(self.number);
+        let oom_kills = memory::oom_kills();
         match start(plan, seat, nursery) {
             Ok(child) => {
                 tracing::debug!(slot = seat.slot, epoch = seat.epoch, pid = child.id(), "worker started");
-                let (ready, killed) = (false, false);
                 let worker = Worker {
                     seat,
                     child,
-                    ready,
-                    killed,
+                    ready: false,
+                    killed: false,
+                    kill_at: None,
+                    useless: false,
+                    oom_kills,
                 };
                 self.state = State::Taken { worker };
             }
@@ -155,7 +198,13 @@ impl Slot {
             return;
         };
         let status = match worker.child.try_wait() {
-            Ok(None) => return,
+            Ok(None) => {
+                if worker.kill_at.is_some_and(|at| at <= now) && !worker.useless {
+                    worker.useless = true;
+                    kill_now(worker.child.id());
+                }
+                return;
+            }
             Ok(Some(status)) => Some(status),
             Err(error) => {
                 tracing::error!(%error, pid = worker.child.id(), "cannot wait for worker");
@@ -170,8 +219,8 @@ impl Slot {
         let State::Taken { worker } = std::mem::replace(&mut self.state, empty) else {
             return;
         };
+        let death = worker.death(status);
         let status = status.map_or_else(|| "unknown".to_owned(), |status| status.to_string());
-        let death = if worker.killed { Death::Killed } else { Death::Own };
         tracing::warn!(
             slot = worker.seat.slot,
             epoch = worker.seat.epoch,

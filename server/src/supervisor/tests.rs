@@ -53,8 +53,13 @@ fn start(worker: &Path, workers: u8) -> (Handle, Witness) {
 
 /// A program that sleeps whatever its arguments are.
 fn sleeper(folder: &Path) -> PathBuf {
-    let path = folder.join("sleeper");
-    std::fs::write(&path, "#!/bin/sh\nexec sleep 1000\n").unwrap();
+    script(folder, "sleeper", "exec sleep 1000")
+}
+
+/// A shell script that ignores its arguments.
+fn script(folder: &Path, name: &str, text: &str) -> PathBuf {
+    let path = folder.join(name);
+    std::fs::write(&path, format!("#!/bin/sh\n{text}\n")).unwrap();
     std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).unwrap();
     path
 }
@@ -129,5 +134,39 @@ fn missing_worker_program_is_named() {
         reason.contains("cannot start /nowhere/worker: No such file"),
         "{reason}"
     );
+    handle.stop();
+}
+
+#[test]
+fn kill_from_outside_is_told_from_a_death_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let death_of = |program: &Path, signal: Option<Signal>| {
+        let (handle, witness) = start(program, 1);
+        let birth = wait(&witness, "birth", |log| log.births.first().map(|birth| birth.0));
+        if let Some(signal) = signal {
+            kill(birth.pid, signal);
+        }
+        let (_, death) = wait(&witness, "death", |log| log.deaths.first().copied());
+        handle.stop();
+        death
+    };
+    let sleeper = sleeper(folder.path());
+    for signal in [Signal::SIGKILL, Signal::SIGTERM] {
+        assert_eq!(death_of(&sleeper, Some(signal)), Death::Outside, "{signal}");
+    }
+    for signal in [Signal::SIGSEGV, Signal::SIGABRT, Signal::SIGBUS] {
+        assert_eq!(death_of(&sleeper, Some(signal)), Death::Own, "{signal}");
+    }
+    assert_eq!(death_of(&script(folder.path(), "quitter", "exit 3"), None), Death::Own);
+}
+
+#[test]
+fn worker_that_hangs_up_and_stays_is_killed_for_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let (handle, witness) = start(&sleeper(folder.path()), 1);
+    let birth = wait(&witness, "birth", |log| log.births.first().map(|birth| birth.0));
+    handle.hangup(birth.seat);
+    let (seat, death) = wait(&witness, "death", |log| log.deaths.first().copied());
+    assert_eq!((seat, death), (birth.seat, Death::Own));
     handle.stop();
 }

@@ -286,7 +286,11 @@ impl World {
         let seat = worker.seat;
         let dies = worker.kill_pending || (!self.calm && self.random.percent(6));
         if dies {
-            let death = if worker.kill_pending { Death::Killed } else { Death::Own };
+            let death = match (worker.kill_pending, self.random.percent(50)) {
+                (true, _) => Death::Killed,
+                (false, true) => Death::Outside,
+                (false, false) => Death::Own,
+            };
             if let Some(held) = worker.held.take() {
                 self.stale.push((seat, held.lease));
             }
