@@ -49,6 +49,25 @@ pub struct CacheCounters {
     pub resident_bytes_peak: u64,
 }
 
+/// What one scene has of a pool, and what was done for it since it was mounted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SceneCounters {
+    /// Pages of its file.
+    pub pages: u64,
+    /// Of these, pages held now.
+    pub resident: u64,
+    /// Pages asked for.
+    pub fetches: u64,
+    /// Pages loaded.
+    pub loads: u64,
+    /// Of these, pages that had been loaded before and evicted.
+    pub reloads: u64,
+    /// Loads of a page that was resident or pinned: always 0.
+    pub redundant_reads: u64,
+    /// Pages evicted to make room.
+    pub evictions: u64,
+}
+
 /// What one job asked of the owner, both kinds of pages together.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct JobCounters {
@@ -105,7 +124,7 @@ impl JobRecord {
     }
 }
 
-/// A set of page numbers.
+/// A set of page or frame numbers.
 #[derive(Debug, Default)]
 pub(crate) struct Bitmap(Vec<u64>);
 
@@ -119,6 +138,11 @@ impl Bitmap {
         let before = self.0[word] & mask != 0;
         self.0[word] |= mask;
         before
+    }
+
+    /// The members from `64 * word` on.
+    pub(crate) fn word(&self, word: usize) -> u64 {
+        self.0.get(word).copied().unwrap_or(0)
     }
 
     /// Takes a page out.

@@ -50,6 +50,8 @@ mod plan;
 #[cfg(not(loom))]
 mod pool;
 #[cfg(not(loom))]
+mod quota;
+#[cfg(not(loom))]
 #[expect(unsafe_code, reason = "creates the mapping: README rules 1 and 9")]
 mod segment;
 #[cfg(not(loom))]
@@ -60,7 +62,7 @@ mod wire;
 #[cfg(not(loom))]
 pub use {
     attach::{CacheView, PagePin},
-    counters::{CacheCounters, JobCounters, PoolCounters},
+    counters::{CacheCounters, JobCounters, PoolCounters, SceneCounters},
     error::{CacheError, LoadError, LoadErrorKind},
     layout::{PoolLayout, SegmentLayout},
     local::{LocalCache, LocalCounters},

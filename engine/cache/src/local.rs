@@ -78,6 +78,20 @@ impl LocalCache {
         Some(unsafe { self.view.frame(key.kind, frame) })
     }
 
+    /// The page, if it is in the local cache; it is not counted as a use.
+    pub fn peek(&self, key: PageKey) -> Option<&[u8]> {
+        let tag = Tag::resident(key);
+        let pool = &self.pools[key.kind as usize];
+        let entry = &pool.front[front_index(tag)];
+        let frame = if entry.tag == tag {
+            entry.frame
+        } else {
+            *pool.lru.peek(&tag)?
+        };
+        // SAFETY: Rule 4, as in `get`: the pin is held, and is given up by methods that borrow `self` exclusively.
+        Some(unsafe { self.view.frame(key.kind, frame) })
+    }
+
     /// Makes room for `count` pages of a kind (at most the capacity, so a request has no more either): **before** the
     /// owner is asked for them, since it pins them in this worker's name and refuses to exceed the capacity (Rule
     /// 10).

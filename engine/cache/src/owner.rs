@@ -3,7 +3,7 @@
 //! Entry points: [`CacheOwner::fetch`], [`CacheOwner::reap`], [`CacheOwner::mount`] and [`CacheOwner::unmount`]. One
 //! lock a pool, in this process only; pages are loaded outside it.
 
-use crate::counters::{CacheCounters, JobCounters};
+use crate::counters::{CacheCounters, JobCounters, SceneCounters};
 use crate::error::{CacheError, LoadError, LoadErrorKind};
 use crate::flight::Role;
 use crate::frame::{FrameId, Tag};
@@ -226,6 +226,12 @@ impl CacheOwner {
             resident_bytes: self.resident_bytes.load(Ordering::Relaxed),
             resident_bytes_peak: self.resident_bytes_peak.load(Ordering::Relaxed),
         }
+    }
+
+    /// The counters of a scene, of its node pages and of its point pages; `None` if it is not mounted.
+    pub fn scene_counters(&self, mount: MountId) -> Option<[SceneCounters; 2]> {
+        let [node, point] = KINDS.map(|kind| self.lock(kind).scene_counters(mount));
+        Some([node?, point?])
     }
 
     /// The counters of a job. A record is kept for each job number until [`CacheOwner::end_job`], for [`JOBS_MAX`] at

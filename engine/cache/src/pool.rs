@@ -1,6 +1,6 @@
 //! One pool as its owner sees it, behind one lock: what is resident where, what is being loaded, what is free.
 
-use crate::counters::{Bitmap, JobRecord, PoolCounters};
+use crate::counters::{Bitmap, JobRecord, PoolCounters, SceneCounters};
 use crate::error::CacheError;
 use crate::flight::Flights;
 use crate::frame::{FrameId, Tag, TagState};
@@ -10,7 +10,8 @@ use crate::map::SegmentMap;
 use crate::owner::{JOBS_MAX, Origin, Seat};
 use crate::page_table;
 use crate::protocol::{FullFence, load_tag, owner_pin, publish, try_claim};
-use crate::victim::Clock;
+use crate::quota::{Holding, Room, room};
+use crate::victim::{Among, Clock};
 use pbgi_core::limits::MOUNTS_MAX;
 use pbgi_core::{MountId, PageKey, PageKind};
 use std::collections::HashMap;
@@ -54,6 +55,11 @@ struct Mount {
     known: Bitmap,
     /// Pages resident now: kept apart from tags and table, to notice a second read that these would not.
     resident: Bitmap,
+    /// Frames that hold its pages.
+    frames: Bitmap,
+    /// The pool's loads when it last asked for a page.
+    asked_at: u64,
+    counters: SceneCounters,
 }
 
 impl PoolState {
@@ -168,18 +174,53 @@ impl PoolState {
             workers: self.workers,
         };
         let mut old = Tag::EMPTY;
-        let victim = self.clock.victim(self.frames, &ledgers, |frame| {
+        let mut claim = |frame: FrameId| {
             let header = &headers[frame.0 as usize];
             old = load_tag(&header.tag);
             let (word, mask) = word_and_mask(frame);
             old.state() == TagState::Resident
                 && try_claim::<FullFence>(&header.tag, old, loading, ledgers.pins(word), mask)
-        });
+        };
+        // Rule 12: where the quota points first; where everything is pinned there, anywhere.
+        let among = match self.room(tag.mount().slot) {
+            Room::Of(slot) => self.mounts[usize::from(slot)].as_ref(),
+            Room::Anywhere => None,
+        };
+        let (clock, frames) = (&mut self.clock, self.frames);
+        let victim = among
+            .and_then(|mount| {
+                let usage = Among {
+                    usage: &ledgers,
+                    frames: &mount.frames,
+                };
+                clock.victim(frames, &usage, &mut claim)
+            })
+            .or_else(|| clock.victim(frames, &ledgers, &mut claim));
         if let Some(frame) = victim {
             freed += self.forget(map, old, frame);
             self.counters.evictions += 1;
+            if let Some(Some(mount)) = self.mounts.get_mut(usize::from(old.mount().slot)) {
+                mount.counters.evictions += 1;
+            }
         }
         (victim, freed)
+    }
+
+    /// Whose frame a load for the scene in `slot` takes.
+    fn room(&self, slot: u8) -> Room {
+        let now = self.counters.loads;
+        let holdings: Vec<Holding> = (0..)
+            .zip(&self.mounts)
+            .filter_map(|(slot, mount)| {
+                let mount = mount.as_ref()?;
+                Some(Holding {
+                    slot,
+                    frames: mount.counters.resident as u32,
+                    at_work: now - mount.asked_at < u64::from(self.frames),
+                })
+            })
+            .collect();
+        room(self.frames, slot, &holdings)
     }
 
     /// Publishes a loaded page, with the pins of everyone who waited for it.
@@ -202,6 +243,9 @@ impl PoolState {
         publish(&header.tag, tag);
         page_table::insert(map.table(kind), tag.hash32(), frame);
         self.page_bytes[frame.0 as usize] = page_bytes as u32;
+        if let Some(Some(mount)) = self.mounts.get_mut(usize::from(key.mount.slot)) {
+            mount.frames.set(frame.0);
+        }
         let epochs = &self.epochs;
         self.flights.land(tag.0, Ok(frame), |seat| {
             if epochs.get(usize::from(seat.slot)) == Some(&seat.epoch) {
@@ -226,6 +270,8 @@ impl PoolState {
             && mount.generation == tag.mount().generation
         {
             mount.resident.clear(tag.page().0);
+            mount.frames.clear(frame.0);
+            mount.counters.resident -= 1;
         }
         self.counters.resident -= 1;
         u64::from(self.page_bytes[frame.0 as usize])
@@ -252,13 +298,18 @@ impl PoolState {
     }
 
     pub(crate) fn mount(&mut self, mount: MountId, page_bytes: usize, pages: u64) {
-        let (known, resident) = (Bitmap::default(), Bitmap::default());
         self.mounts[usize::from(mount.slot)] = Some(Mount {
             generation: mount.generation,
             page_bytes,
             pages,
-            known,
-            resident,
+            known: Bitmap::default(),
+            resident: Bitmap::default(),
+            frames: Bitmap::default(),
+            asked_at: self.counters.loads,
+            counters: SceneCounters {
+                pages,
+                ..SceneCounters::default()
+            },
         });
     }
 
@@ -319,12 +370,23 @@ impl PoolState {
         }
     }
 
+    /// The counters of a mounted scene.
+    pub(crate) fn scene_counters(&self, id: MountId) -> Option<SceneCounters> {
+        let mount = self.mounts.get(usize::from(id.slot))?.as_ref()?;
+        (mount.generation == id.generation).then_some(mount.counters)
+    }
+
     pub(crate) fn count_fetch(&mut self, seat: Seat, key: PageKey, job: u64) -> Result<(), CacheError> {
         self.check(seat, key)?;
         if self.jobs.len() >= JOBS_MAX && !self.jobs.contains_key(&job) {
             return Err(CacheError::TooManyJobs { limit: JOBS_MAX });
         }
         self.counters.fetches += 1;
+        let loads = self.counters.loads;
+        if let Some(Some(mount)) = self.mounts.get_mut(usize::from(key.mount.slot)) {
+            mount.asked_at = loads;
+            mount.counters.fetches += 1;
+        }
         self.jobs.entry(job).or_default().counters.fetches += 1;
         Ok(())
     }
@@ -357,6 +419,10 @@ impl PoolState {
         let page = key.page.0;
         let redundant = u64::from(mount.resident.set(page));
         let reload = u64::from(mount.known.set(page));
+        mount.counters.resident += 1;
+        mount.counters.loads += 1;
+        mount.counters.reloads += reload;
+        mount.counters.redundant_reads += redundant;
         self.counters.redundant_reads += redundant;
         self.counters.reloads += reload;
         let record = self.jobs.entry(job).or_default();

@@ -1,6 +1,7 @@
 //! Which frame to reuse: second chance (clock) over the frames that nobody pins, with the recency that workers leave
 //! in their touched bits.
 
+use crate::counters::Bitmap;
 use crate::frame::FrameId;
 
 /// Laps of the hand before giving up: one clears touched bits, one meets them cleared, one ignores them, in case
@@ -15,6 +16,29 @@ pub(crate) trait Usage {
     fn touched(&self, word: usize) -> u64;
     /// Forgets that they were touched.
     fn clear_touched(&self, word: usize, frames: u64);
+}
+
+/// Usage in which only some frames may go: the others count as pinned, so that they keep their touched bits.
+pub(crate) struct Among<'a, U> {
+    pub(crate) usage: &'a U,
+    pub(crate) frames: &'a Bitmap,
+}
+
+impl<U: Usage> Usage for Among<'_, U> {
+    fn pinned(&self, word: usize) -> u64 {
+        match self.frames.word(word) {
+            0 => !0,
+            frames => !frames | self.usage.pinned(word),
+        }
+    }
+
+    fn touched(&self, word: usize) -> u64 {
+        self.usage.touched(word)
+    }
+
+    fn clear_touched(&self, word: usize, frames: u64) {
+        self.usage.clear_touched(word, frames);
+    }
 }
 
 /// The clock's hand over one pool.

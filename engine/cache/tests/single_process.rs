@@ -111,6 +111,60 @@ fn evicted_page_is_read_again_and_counted_as_reload() {
     assert_eq!(owner.job_counters(1).loads, 0, "forgotten");
 }
 
+/// A key of the other scene.
+fn other(page: u32) -> pbgi_core::PageKey {
+    pbgi_core::PageKey {
+        mount: OTHER_MOUNT,
+        ..node(page)
+    }
+}
+
+/// Loads pages `pages` of a scene by turns, keeping none pinned.
+fn visit(owner: &CacheOwner, key: impl Fn(u32) -> pbgi_core::PageKey, pages: std::ops::Range<u32>) {
+    for page in pages {
+        load(owner, 0, key(page), 1);
+        owner.reap(0).unwrap();
+    }
+}
+
+#[test]
+fn huge_scene_does_not_empty_the_cache_of_the_others() {
+    let owner = owner(1, 64, 4, 2);
+    owner.mount(OTHER_MOUNT, &scene(PAGES)).unwrap();
+    let node_pages = |mount| owner.scene_counters(mount).unwrap()[0];
+    // Alone, a scene has everything.
+    visit(&owner, node, 0..64);
+    assert_eq!((node_pages(MOUNT).resident, node_pages(MOUNT).evictions), (64, 0));
+    // While the first rests, the other leaves it an eighth, however much it reads.
+    visit(&owner, other, 0..2000);
+    assert_eq!((node_pages(MOUNT).resident, node_pages(OTHER_MOUNT).resident), (8, 56));
+    assert_eq!(node_pages(OTHER_MOUNT).reloads, 0);
+    // When the first is back at work, half is its own again, and stays so.
+    visit(&owner, node, 0..32);
+    for page in 2000..3000 {
+        visit(&owner, other, page..page + 1);
+        visit(&owner, node, page % 32..page % 32 + 1);
+    }
+    assert_eq!((node_pages(MOUNT).resident, node_pages(OTHER_MOUNT).resident), (32, 32));
+    let first = node_pages(MOUNT);
+    visit(&owner, node, 0..32);
+    assert_eq!(node_pages(MOUNT).loads, first.loads, "its pages were left alone");
+    assert_eq!(owner.counters().node.redundant_reads, 0);
+}
+
+#[test]
+fn counters_of_a_scene_go_with_its_mount() {
+    let owner = owner(1, 16, 4, 2);
+    visit(&owner, node, 0..40);
+    visit(&owner, node, 39..41);
+    let [nodes, points] = owner.scene_counters(MOUNT).unwrap();
+    assert_eq!((nodes.pages, nodes.resident, nodes.fetches), (u64::from(PAGES), 16, 42));
+    assert_eq!((nodes.loads, nodes.reloads, nodes.evictions), (41, 0, 25));
+    assert_eq!((points.resident, points.loads), (0, 0));
+    owner.unmount(MOUNT);
+    assert_eq!(owner.scene_counters(MOUNT), None);
+}
+
 #[test]
 fn pinned_page_survives_any_number_of_loads() {
     let owner = owner(2, 16, 4, 2);
@@ -383,15 +437,20 @@ fn scene_on_slow_storage_leaves_loads_to_the_others() {
             };
             owner.fetch(owner.seat(2).unwrap(), node(2), 1, load).unwrap();
         });
-        for page in 0..4 {
-            let key = pbgi_core::PageKey {
-                mount: OTHER_MOUNT,
-                ..node(page)
-            };
-            owner
-                .fetch(owner.seat(3).unwrap(), key, 2, |page| fill(page, key))
-                .unwrap();
-        }
+        let mut waits: Vec<Duration> = (0..500)
+            .map(|page| {
+                let (key, start) = (other(page), Instant::now());
+                let fetched = owner.fetch(owner.seat(3).unwrap(), key, 2, |page| fill(page, key));
+                fetched.unwrap();
+                let wait = start.elapsed();
+                owner.reap(3).unwrap();
+                wait
+            })
+            .collect();
+        waits.sort_unstable();
+        let (p99, bound) = (waits[waits.len() * 99 / 100], Duration::from_millis(50));
+        println!("RELIABILITY F14: 500 loads beside a scene whose reads hang: 99 of 100 within {p99:?}");
+        assert!(p99 < bound, "{p99:?}");
         std::thread::sleep(Duration::from_millis(20));
         assert_eq!(
             third.load(Ordering::Relaxed),
@@ -400,7 +459,7 @@ fn scene_on_slow_storage_leaves_loads_to_the_others() {
         );
         done.wait();
     });
-    assert_eq!(owner.counters().node.loads, 7);
+    assert_eq!(owner.counters().node.loads, 503);
 }
 
 #[test]
