@@ -5,6 +5,7 @@
 //! pages come from. It never links the builder.
 #![forbid(unsafe_code)]
 
+mod ahead;
 mod attach;
 mod error;
 pub mod pages;

@@ -1,8 +1,10 @@
 //! The glue from cache to shade: a node or point by index becomes a slice of a page, wherever that page is.
 //!
-//! Looks in the local cache, then in the shared one, then asks the daemon over the miss channel. Indices come from files and
+//! Looks in the local cache, then in the shared one, then asks the daemon over the miss channel, with whatever else the walk
+//! is about to need (`ahead`). Indices come from files and
 //! are checked against the scene's counts, so that a forged scene ends in an error and nowhere else.
 
+use crate::ahead::{Ahead, Paging};
 use crate::shading::FailureKind;
 use pbgi_cache::channel::{self, PageOutcome, PageReply, PageRequest};
 use pbgi_cache::{CacheError, LoadErrorKind, LocalCache, Origin};
@@ -18,6 +20,7 @@ pub struct Pages {
     cache: LocalCache,
     channel: UnixStream,
     requests: u64,
+    ahead: Ahead,
 }
 
 impl Pages {
@@ -27,32 +30,44 @@ impl Pages {
             cache,
             channel,
             requests: 0,
+            ahead: Ahead::default(),
         }
     }
 
-    /// Has the daemon load a page, and adopts it.
+    /// Has the daemon load a page, and others that will be needed soon, and adopts them. The missing page comes first.
     #[cold]
-    fn load(&mut self, key: PageKey, job: u64) -> Result<Origin, Fault> {
-        let span = tracing::debug_span!("page load", kind = %key.kind, page = key.page.0);
+    fn load(&mut self, missing: PageKey, job: u64) -> Result<Vec<Origin>, Fault> {
+        let span = tracing::debug_span!("page load", kind = %missing.kind, page = missing.page.0);
         let _entered = span.enter();
-        // Before asking: the daemon pins the page in this worker's name.
-        self.cache.reserve(key.kind, 1);
+        let keys = self.ahead.request(&self.cache, missing);
+        // Before asking: the daemon pins the pages in this worker's name.
+        for kind in [PageKind::Node, PageKind::Point] {
+            match keys.iter().filter(|key| key.kind == kind).count() {
+                0 => {}
+                count => self.cache.reserve(kind, count),
+            }
+        }
         self.requests += 1;
         let id = self.requests;
-        let keys = vec![key];
-        channel::send(&self.channel, &PageRequest { id, job, keys })?;
+        let request = PageRequest { id, job, keys };
+        channel::send(&self.channel, &request)?;
         let reply: PageReply = channel::receive(&self.channel)?
             .ok_or_else(|| Fault(FailureKind::Io, "the daemon closed the page channel".to_owned()))?;
-        match (reply.id == id, &reply.outcomes[..]) {
-            (true, [PageOutcome::Pinned(fetched)]) => {
+        if reply.id != id || reply.outcomes.len() != request.keys.len() {
+            let text = format!("reply {} with {} pages to request {id}", reply.id, reply.outcomes.len());
+            return Err(Fault(FailureKind::Internal, text));
+        }
+        // The missing page last, so that it is the most recently used. One that was only asked for ahead may fail.
+        let mut origins = Vec::with_capacity(request.keys.len());
+        for (&key, outcome) in request.keys.iter().zip(&reply.outcomes).rev() {
+            if let PageOutcome::Pinned(fetched) = outcome {
                 self.cache.adopt(key, fetched.frame)?;
-                Ok(fetched.origin)
+                origins.push(fetched.origin);
             }
-            (true, [PageOutcome::Failed(kind)]) => Err(Fault(failure_kind(*kind), reply.error)),
-            _ => {
-                let text = format!("reply {} with {} pages to request {id}", reply.id, reply.outcomes.len());
-                Err(Fault(FailureKind::Internal, text))
-            }
+        }
+        match reply.outcomes.first() {
+            Some(PageOutcome::Failed(kind)) => Err(Fault(failure_kind(*kind), reply.error)),
+            _ => Ok(origins),
         }
     }
 }
@@ -61,6 +76,7 @@ impl Pages {
 #[derive(Debug)]
 pub struct SceneView {
     mount: MountId,
+    paging: Paging,
     nodes: FileView,
     points: FileView,
     /// Number of the pack of receivers that is being shaded.
@@ -90,6 +106,7 @@ impl SceneView {
         };
         Self {
             mount,
+            paging: Paging::new(scene, mount),
             nodes: file(PageKind::Node, scene.node_slots, scene.settings.nodes_per_page),
             points: file(PageKind::Point, scene.point_count, scene.settings.points_per_page),
             pack: 0,
@@ -172,7 +189,8 @@ impl<'a> PageSource<'a> {
         let mut counters = self.counters;
         counters.shared_hits = shared_hits;
         counters.shared_hits_other_job += found.shared_hits_other_job;
-        counters.local_hits = self.accesses - shared_hits - counters.cache_misses;
+        // Pages that came ahead were not looked for.
+        counters.local_hits = self.accesses.saturating_sub(shared_hits + counters.cache_misses);
         counters
     }
 
@@ -235,13 +253,16 @@ impl<'a> PageSource<'a> {
         let start = Instant::now();
         let loaded = self.pages.load(key, self.job);
         self.counters.io_nanos += start.elapsed().as_nanos() as u64;
-        let origin = loaded.map_err(|fault| self.fail(fault))?;
-        match origin {
-            Origin::Loaded => self.counters.cache_misses += 1,
-            Origin::Resident => self.counters.shared_hits += 1,
-            Origin::ResidentOtherJob => {
-                self.counters.shared_hits += 1;
-                self.counters.shared_hits_other_job += 1;
+        // Other pages may have gone to make room.
+        self.places = [None; 2];
+        for origin in loaded.map_err(|fault| self.fail(fault))? {
+            match origin {
+                Origin::Loaded => self.counters.cache_misses += 1,
+                Origin::Resident => self.counters.shared_hits += 1,
+                Origin::ResidentOtherJob => {
+                    self.counters.shared_hits += 1;
+                    self.counters.shared_hits_other_job += 1;
+                }
             }
         }
         Ok(())
@@ -290,6 +311,12 @@ impl SceneSource for PageSource<'_> {
         let start = slot as usize * BYTES;
         let bytes = self.bytes(place, start, start + count as usize * BYTES)?;
         bytemuck::try_cast_slice(bytes).map_err(|_| lost(place))
+    }
+
+    #[inline]
+    fn expect(&mut self, first: NodeIndex, mask: u8) {
+        let Pages { cache, ahead, .. } = &mut *self.pages;
+        ahead.expect(cache, &self.scene.paging, first, mask);
     }
 
     fn begin_pack(&mut self) {

@@ -4,7 +4,7 @@
 
 use pbgi_cache::channel::{self, PageReply, PageRequest};
 use pbgi_cache::{CacheOwner, CacheView, LoadError, LoadErrorKind, LocalCache, PoolLayout, Segment, SegmentLayout};
-use pbgi_core::{BuildId, BuildSettings, MountId, NodeIndex, PageKey, PageKind, PointIndex, SceneInfo};
+use pbgi_core::{BuildId, BuildSettings, MountId, NodeIndex, NodeRecord, PageKey, PageKind, PointIndex, SceneInfo};
 use pbgi_shade::{SceneSource, SourceError};
 use pbgi_worker::FailureKind;
 use pbgi_worker::pages::{PageSource, Pages, SceneView};
@@ -51,6 +51,11 @@ fn fill(page: &mut [u8], key: PageKey) -> Result<(), LoadError> {
     for (slot, record) in page.chunks_exact_mut(record_bytes).enumerate() {
         let index = (key.page.0 * RECORDS_PER_PAGE) as f32 + slot as f32;
         record[..4].copy_from_slice(&index.to_le_bytes());
+        if key.kind == PageKind::Node {
+            // The children of the n-th node of a page are on the n-th page after the first.
+            let node: &mut NodeRecord = bytemuck::from_bytes_mut(record);
+            node.set_first_child(NodeIndex((slot as u32 + 1) * RECORDS_PER_PAGE));
+        }
     }
     Ok(())
 }
@@ -178,4 +183,28 @@ fn counters_add_up_and_a_receiver_pays_for_a_page_once() {
     );
     drop(pages);
     thread.join().unwrap();
+}
+
+#[test]
+fn pages_expected_soon_come_with_the_missing_one_and_push_out_nothing() {
+    for (local_frames, ahead) in [(16, 8), (4, 2)] {
+        let (mut pages, thread) = daemon(local_frames);
+        let mut view = SceneView::new(&scene(), MOUNT);
+        let mut source = PageSource::new(&mut pages, &mut view, 1);
+        source.begin_pack();
+        source.node(NodeIndex(0), 1).unwrap();
+        assert_eq!(source.counters().cache_misses, 1);
+        // Their children are on the pages 1 to 8.
+        source.expect(NodeIndex(0), 0xff);
+        source.node(NodeIndex(9 * RECORDS_PER_PAGE), 1).unwrap();
+        assert_eq!(source.counters().cache_misses, 2 + ahead, "{local_frames} frames");
+        // The first page is still held; so are the expected ones, latest first.
+        for page in std::iter::once(0).chain(9 - ahead as u32..=9) {
+            source.node(NodeIndex(page * RECORDS_PER_PAGE), 1).unwrap();
+        }
+        let counters = source.counters();
+        assert_eq!((counters.cache_misses, counters.shared_hits), (2 + ahead, 0));
+        drop(pages);
+        assert_eq!(thread.join().unwrap().counters().node.redundant_reads, 0);
+    }
 }

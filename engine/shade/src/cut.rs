@@ -189,7 +189,10 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
             }
             opened &= !together;
             match kind {
-                NodeKind::Inner { first, mask } => push_children(stack, &visit, &node, first, mask, near, together),
+                NodeKind::Inner { first, mask } => {
+                    source.expect(first, mask);
+                    push_children(stack, &visit, &node, first, mask, near, together);
+                }
                 _ => painter.draw_parts(parts, order, &visit, near, together),
             }
         }

@@ -17,6 +17,13 @@ pub trait SceneSource {
     /// The range is out of bounds, or its page cannot be had.
     fn points(&mut self, first: PointIndex, count: u32, receivers: u8) -> Result<&[PointRecord], SourceError>;
 
+    /// A walk is about to look at the siblings from `first` on, one for each bit of `mask`: a hint, for a source that has
+    /// to fetch pages.
+    #[inline]
+    fn expect(&mut self, first: NodeIndex, mask: u8) {
+        let _ = (first, mask);
+    }
+
     /// Another pack of receivers begins: what is counted per receiver starts anew.
     fn begin_pack(&mut self) {}
 }
