@@ -1,5 +1,6 @@
 //! The connection to a daemon.
 
+use crate::cache::CacheStatus;
 use crate::convert;
 use crate::error::{ClientError, Refusal};
 use crate::job::{BuildJob, DaemonStatus, Job, JobOptions, ShadeJob};
@@ -306,6 +307,16 @@ impl Client {
         let answer = SceneServiceClient::new(self.channel.clone())
             .get_scene_shape(wish.request(v1::GetSceneRequest { scene }))
             .await;
+        Ok(answer.map_err(|status| wish.failed(&status))?.into_inner().into())
+    }
+
+    /// What the daemon's page cache holds.
+    ///
+    /// # Errors
+    /// A lost connection.
+    pub async fn cache(&self) -> Result<CacheStatus, ClientError> {
+        let wish = Wish::new("ask for the state of the page cache", REQUEST_SECS);
+        let answer = self.daemon().get_cache(wish.request(v1::GetCacheRequest {})).await;
         Ok(answer.map_err(|status| wish.failed(&status))?.into_inner().into())
     }
 

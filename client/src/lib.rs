@@ -5,6 +5,7 @@
 //! The `pbgi-client` command line is built on this crate.
 #![forbid(unsafe_code)]
 
+mod cache;
 mod client;
 mod convert;
 mod error;
@@ -13,6 +14,7 @@ pub mod private;
 mod shape;
 pub mod size;
 
+pub use cache::{CachePins, CachePool, CacheStatus, CachedFile, CachedScene, Lookups};
 pub use client::Client;
 pub use error::{ClientError, Refusal};
 pub use job::{BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};

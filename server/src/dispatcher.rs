@@ -9,7 +9,7 @@ mod figures;
 mod live;
 mod upkeep;
 
-pub use clients::{DaemonStatus, Submission};
+pub use clients::{CacheReport, DaemonStatus, Submission};
 pub use figures::{JobFigures, Totals};
 
 use crate::config::Config;
@@ -292,7 +292,12 @@ impl Dispatcher {
         let mut state = self.lock();
         state.build_pids.remove(&job);
         if let (Some(record), Ok(statistics)) = (state.jobs.get(&job), &outcome) {
-            record.status.send_modify(|status| status.statistics.update(statistics));
+            record.status.send_modify(|status| {
+                status.statistics.update(statistics);
+                if let Some(text) = statistics.diagnosis() {
+                    status.note(text);
+                }
+            });
         }
         let outcome = outcome.map(|_| ());
         self.dispatch(&mut state, Event::Finished { job, outcome }, None);

@@ -44,6 +44,8 @@ impl Mounted {
 /// A mount, for people.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MountStatus {
+    /// Its id in page keys.
+    pub id: MountId,
     /// The real path.
     pub path: PathBuf,
     /// What is mounted.
@@ -156,6 +158,7 @@ impl Mounts {
     pub fn list(&self) -> Vec<MountStatus> {
         let state = self.lock();
         let status = |entry: &Entry| MountStatus {
+            id: entry.mount.id,
             path: entry.mount.path.clone(),
             build_id: entry.mount.scene.info().build_id,
             pages_loaded: entry.mount.pages_loaded.load(Ordering::Relaxed),

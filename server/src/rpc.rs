@@ -4,6 +4,7 @@
 //! Unix socket only).
 
 mod accept;
+mod cache;
 mod convert;
 mod gate;
 mod jobs;

@@ -1,6 +1,7 @@
 //! The commands, one module each, and what they share: arguments, failures, files, progress, summaries.
 
 mod args;
+mod cache;
 mod composite;
 mod daemon;
 mod failure;
@@ -63,6 +64,8 @@ enum Command {
     Info(daemon::InfoArgs),
     /// Show the daemon: memory, workers, open scenes
     Status(daemon::StatusArgs),
+    /// Show the daemon's page cache: what it holds for which scene, who pins it, how often it had what was asked for
+    Cache(cache::CacheArgs),
     /// List the daemon's jobs, newest first
     Jobs(jobs::ListArgs),
     /// Follow a job to its end
@@ -129,6 +132,7 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
         Command::Shade(args) => jobs::shade(args, interrupt).await,
         Command::Info(args) => daemon::info(args, interrupt).await,
         Command::Status(args) => daemon::status(args, interrupt).await,
+        Command::Cache(args) => cache::cache(args, interrupt).await,
         Command::Jobs(args) => jobs::list(args, interrupt).await,
         Command::Watch(args) => jobs::watch(args, interrupt).await,
         Command::Cancel(args) => jobs::cancel(args, interrupt).await,

@@ -14,6 +14,9 @@ const EXACT_MAX: f64 = 9_007_199_254_740_992.0;
 /// Prints the table, and writes the file if one is asked for.
 pub(crate) fn report(statistics: &Statistics, file: Option<&Path>) -> Result<(), Failure> {
     print!("{}", table(statistics));
+    if let Some(text) = statistics.diagnosis() {
+        eprintln!("note: {text}");
+    }
     match file {
         Some(path) => files::write_whole(path, json(statistics).as_bytes()),
         None => Ok(()),

@@ -118,9 +118,59 @@ statistics! {
     holes: Count "Holes",
 }
 
+/// Reloads per page loaded from which the cache is said to be too small: one page in four was read before.
+const RELOADS_TOO_MANY: f64 = 0.25;
+
+impl Statistics {
+    /// What was wrong with the memory, for people: whether a cut fitted the cache.
+    pub fn diagnosis(&self) -> Option<String> {
+        let (reloads, loads) = (self.reloads?, self.pages_loaded?);
+        if reloads == 0.0 || reloads < loads * RELOADS_TOO_MANY {
+            return None;
+        }
+        let mib = |bytes: f64| format!("{:.1} MiB", bytes / f64::from(1 << 20));
+        let (cut, cache) = (self.average_traversal_bytes?, self.cache_peak_bytes?);
+        // Workers may hold half of the cache (the other half is what they let go of last).
+        let what = if cut > cache / 2.0 {
+            "a receiver's cut does not fit the cache"
+        } else {
+            "the cuts of neighbouring receivers do not fit the cache together"
+        };
+        Some(format!(
+            "{what}: {reloads:.0} of {loads:.0} page loads were of pages that had been evicted; a receiver touches {} of \
+             pages on average, and the cache held {} at most; give the daemon more --memory, or build the scene with \
+             smaller pages",
+            mib(cut),
+            mib(cache)
+        ))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn cut_that_does_not_fit_is_told_from_cuts_that_do_not_fit_together() {
+        let statistics = |reloads, traversal| Statistics {
+            reloads: Some(reloads),
+            pages_loaded: Some(1000.0),
+            average_traversal_bytes: Some(traversal),
+            cache_peak_bytes: Some(8e6),
+            ..Statistics::default()
+        };
+        assert_eq!(Statistics::default().diagnosis(), None);
+        assert_eq!(statistics(0.0, 5e6).diagnosis(), None);
+        assert_eq!(statistics(200.0, 5e6).diagnosis(), None);
+        let alone = statistics(300.0, 5e6).diagnosis().unwrap();
+        assert!(alone.starts_with("a receiver's cut does not fit"), "{alone}");
+        assert!(
+            alone.contains("300 of 1000") && alone.contains("4.8 MiB") && alone.contains("7.6 MiB"),
+            "{alone}"
+        );
+        let together = statistics(300.0, 3e6).diagnosis().unwrap();
+        assert!(together.starts_with("the cuts of neighbouring"), "{together}");
+    }
 
     #[test]
     fn rows_are_set_and_read_by_name() {

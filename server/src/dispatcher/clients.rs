@@ -8,8 +8,9 @@ use crate::limits;
 use crate::mounts::{MountStatus, Mounted};
 use crate::roots::Want;
 use crate::scheduler::{DRAINING, Event, JobNo, Order};
+use crate::shade_job::Counters;
 use crate::supervisor::WorkerBirth;
-use pbgi_cache::CacheCounters;
+use pbgi_cache::{CacheCounters, SceneCounters, SegmentLayout};
 use pbgi_core::{Environment, NodeRecord, PageKind, PageNo, PointRecord, SceneInfo, Statistics};
 use pbgi_store::SceneShape;
 use std::collections::VecDeque;
@@ -35,6 +36,21 @@ pub struct DaemonStatus {
     pub jobs_queued: usize,
     /// Jobs that run.
     pub jobs_running: usize,
+}
+
+/// The page cache, for people.
+#[derive(Clone, Debug)]
+pub struct CacheReport {
+    /// What it is made of.
+    pub layout: SegmentLayout,
+    /// What was done with it.
+    pub cache: CacheCounters,
+    /// Scenes, with the counters of their nodes and points.
+    pub scenes: Vec<(MountStatus, [SceneCounters; 2])>,
+    /// Workers: who, and how many node and point frames they hold.
+    pub workers: Vec<(WorkerBirth, [u32; 2])>,
+    /// What workers found where, in all tiles since the start.
+    pub lookups: Counters,
 }
 
 /// A job as it is handed in.
@@ -449,6 +465,28 @@ impl Dispatcher {
             mounts,
             jobs_queued,
             jobs_running,
+        }
+    }
+
+    /// The page cache.
+    pub fn cache_report(&self) -> CacheReport {
+        let counted = |mount: MountStatus| {
+            let counters = self.cache.scene_counters(mount.id)?;
+            Some((mount, counters))
+        };
+        let (cache, scenes) = (self.cache.counters(), self.mounts.list());
+        let state = self.lock();
+        let pins = |sitting: &super::Sitting| {
+            let slot = sitting.birth.seat.slot;
+            let held = [PageKind::Node, PageKind::Point].map(|kind| self.cache.pins(slot, kind));
+            (sitting.birth, held)
+        };
+        CacheReport {
+            layout: *self.cache.layout(),
+            cache,
+            scenes: scenes.into_iter().filter_map(counted).collect(),
+            workers: state.seats.iter().flatten().map(pins).collect(),
+            lookups: state.totals.counters,
         }
     }
 

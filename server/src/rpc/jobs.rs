@@ -1,8 +1,8 @@
 //! What clients may ask: jobs, scenes, the daemon.
 
-use super::convert;
 use super::gate::Caller;
 use super::status::status;
+use super::{cache, convert};
 use crate::dispatcher::{Dispatcher, Submission};
 use crate::error::{JobError, JobErrorKind};
 use crate::job::JobStatus;
@@ -182,6 +182,10 @@ impl SceneService for Jobs {
 impl DaemonService for Jobs {
     async fn get_status(&self, _: Request<v1::GetStatusRequest>) -> Result<Response<v1::DaemonStatus>, Status> {
         Ok(Response::new(convert::daemon(self.dispatcher.status())))
+    }
+
+    async fn get_cache(&self, _: Request<v1::GetCacheRequest>) -> Result<Response<v1::CacheStatus>, Status> {
+        Ok(Response::new(cache::status(self.dispatcher.cache_report())))
     }
 
     async fn shutdown(&self, _: Request<v1::ShutdownRequest>) -> Result<Response<v1::ShutdownResponse>, Status> {
