@@ -1,0 +1,116 @@
+//! The price of the cache when nothing has to be fetched: the same shading code over plain arrays, over memory-mapped files and
+//! over a cache that holds the scene.
+
+use crate::costs::{MOUNT, owner, with_worker};
+use crate::policy::{arrays, tiles};
+use crate::town::Town;
+use pbgi_core::{NodeIndex, NodeRecord, PageKind, PointIndex, PointRecord, ShadeSettings};
+use pbgi_shade::{Receiver, SceneSource, Shaded, Shader, SourceError};
+use pbgi_store::Scene;
+use pbgi_worker::pages::{PageSource, SceneView};
+use std::fs::File;
+use std::time::Instant;
+
+const SIZE: (u32, u32) = (64, 64);
+const ROUNDS: usize = 3;
+/// Bytes before the first page of a file.
+const HEADER_BYTES: usize = 4096;
+
+/// The scene's files in the address space: what a renderer without a cache would do.
+struct Mapped {
+    nodes: memmap2::Mmap,
+    points: memmap2::Mmap,
+    node_count: usize,
+    point_count: usize,
+}
+
+impl Mapped {
+    fn open(scene: &Scene) -> Self {
+        let map = |name: &str| {
+            let file = File::open(scene.path().join(name)).unwrap();
+            // SAFETY: the bench made the file and nobody else writes to it.
+            #[expect(unsafe_code, reason = "what is compared with")]
+            unsafe { memmap2::Mmap::map(&file) }.unwrap()
+        };
+        Self {
+            nodes: map("nodes.pages"),
+            points: map("points.pages"),
+            node_count: scene.info().node_slots as usize,
+            point_count: scene.info().point_count as usize,
+        }
+    }
+}
+
+impl SceneSource for Mapped {
+    #[inline]
+    fn node(&mut self, index: NodeIndex, _receivers: u8) -> Result<&NodeRecord, SourceError> {
+        let bytes = &self.nodes[HEADER_BYTES..][..self.node_count * size_of::<NodeRecord>()];
+        let nodes: &[NodeRecord] = bytemuck::cast_slice(bytes);
+        nodes
+            .get(index.0 as usize)
+            .ok_or_else(|| SourceError::Corrupt("node out of range".into()))
+    }
+
+    #[inline]
+    fn points(&mut self, first: PointIndex, count: u32, _receivers: u8) -> Result<&[PointRecord], SourceError> {
+        let bytes = &self.points[HEADER_BYTES..][..self.point_count * size_of::<PointRecord>()];
+        let points: &[PointRecord] = bytemuck::cast_slice(bytes);
+        points
+            .get(first.0 as usize..first.0 as usize + count as usize)
+            .ok_or_else(|| SourceError::Corrupt("points out of range".into()))
+    }
+}
+
+fn shade(scene: &Scene, tiles: &[Vec<Vec<Receiver>>], source: &mut impl SceneSource) -> (f64, Vec<Shaded>) {
+    let mut shader = Shader::new(scene.info(), ShadeSettings::default(), None).unwrap();
+    let mut all = Vec::new();
+    let start = Instant::now();
+    for group in tiles.iter().flatten() {
+        let mut out = vec![Shaded::default(); group.len()];
+        shader.shade_group(group, source, &mut out).unwrap();
+        all.extend(out);
+    }
+    (start.elapsed().as_secs_f64(), all)
+}
+
+/// Prints the table.
+pub(crate) fn print(scene: &Scene) {
+    let info = scene.info();
+    let receivers = Town::new(info.point_count).receivers(SIZE.0, SIZE.1);
+    let tiles = tiles(&receivers, SIZE);
+    let (mut arrays, mut mapped) = (arrays(scene), Mapped::open(scene));
+    // Half of the frames may be held by the worker, and all pages fit into that half.
+    let frames = |kind| 2 * info.page_count(kind) as u32 + 8;
+    let owner = owner(info, frames(PageKind::Node), frames(PageKind::Point));
+    let best = with_worker(&owner, scene, |mut pages| {
+        let mut view = SceneView::new(info, MOUNT);
+        let mut source = PageSource::new(&mut pages, &mut view, 1);
+        let mut best = [f64::INFINITY; 3];
+        // The first round warms up and does not count.
+        for round in 0..=ROUNDS {
+            let (a, values) = shade(scene, &tiles, &mut arrays);
+            let (b, from_files) = shade(scene, &tiles, &mut mapped);
+            let (c, from_cache) = shade(scene, &tiles, &mut source);
+            assert!(values == from_files && values == from_cache, "other values");
+            if round > 0 {
+                best = [best[0].min(a), best[1].min(b), best[2].min(c)];
+            }
+        }
+        best
+    });
+    println!(
+        "in core, {} receivers, one thread, best of {ROUNDS} rounds: the same values from each",
+        receivers.len()
+    );
+    for (name, seconds) in ["plain arrays", "memory-mapped files", "this cache, all pages resident"]
+        .iter()
+        .zip(best)
+    {
+        println!(
+            "  {name:<32} {:8.2} us a receiver, {:.3} of the speed of arrays",
+            seconds * 1e6 / receivers.len() as f64,
+            best[0] / seconds
+        );
+    }
+    println!();
+}
