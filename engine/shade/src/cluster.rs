@@ -26,7 +26,7 @@ const ROUND_SHARE: f32 = 0.2;
 pub(crate) const SAME_SURFACE: f32 = 0.7;
 /// The same for elements that the receiver nearly touches, facing the same way; shading normals lean, and folds turn within
 /// an element.
-const SAME_SHEET: f32 = 0.5;
+pub(crate) const SAME_SHEET: f32 = 0.5;
 /// How far behind an element's plane a receiver on the same surface may lie, as a share of the element's width.
 const SHEET_DEPTH: f32 = 0.15;
 /// The same for a receiver inside the element's voxel, to either side.

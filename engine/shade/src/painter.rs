@@ -1,6 +1,6 @@
 //! Draws the elements of a cut into the raster and sums what they add, for eight receivers at a time.
 
-use crate::cluster::{Cluster, SECTION_FILL, is_aligned, is_own_surface, orthonormal_pair, rectangle_of};
+use crate::cluster::{Cluster, SAME_SHEET, SECTION_FILL, is_aligned, is_own_surface, orthonormal_pair, rectangle_of};
 use crate::cut::{Pack, Visit, Walk};
 use crate::footprint::{Footprint, Plane};
 use crate::leaf::{Disc, Facet, Part};
@@ -17,6 +17,10 @@ const DISC_SCALE: f32 = 1.4;
 const NEAR_RADII: f32 = 6.0;
 /// Width of what a disc or facet stands for, in radii, when asked whether a receiver lies on it.
 const DISC_WIDTH: f32 = 4.0;
+/// A receiver under a disc is on it within this many radii ...
+const UNDER_DEPTH: f32 = 0.5;
+/// ... and within this many behind one that faces as it does.
+const BEHIND_DEPTH: f32 = 1.25;
 /// Distance from a plane, as a share of half a voxel's edge or of a disc's radius, that is no distance.
 const TOUCH: f32 = 1e-3;
 /// Share of covered bits from which it pays to ask whether a voxel is hidden.
@@ -241,12 +245,8 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let frames = &self.pack.frames;
         let (center, normal) = (self.pack.relative(disc.center), Vector::splat(disc.normal));
         let plane = Plane::through(frames, center, normal, TOUCH * disc.radius);
-        let reach = NEAR_RADII * disc.radius;
-        let near = center.length_squared().less(F::splat(reach * reach));
-        let touched =
-            is_aligned(frames.z, normal) & plane.distance.less(F::splat(self.walk.settings.bias * disc.radius));
-        let own = touched | is_own_surface(frames.z, normal, center, DISC_WIDTH * disc.radius);
-        let lanes = lanes & !(near & own).lanes();
+        let own = self.is_own_disc(disc, center, normal, plane.distance);
+        let lanes = lanes & !own.lanes();
         if lanes == 0 {
             return;
         }
@@ -262,6 +262,25 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         if let Some(covered) = self.cover(&footprint, lanes, None, weight, 0) {
             self.add_light(disc.radiance, normal, center, covered.light);
         }
+    }
+
+    /// The lanes in which a disc is the receiver's own surface, or so near that points cannot tell: below the distance between
+    /// points nothing is known of a surface, and a disc reaches over its edge.
+    #[inline(always)]
+    fn is_own_disc(&self, disc: &Disc, center: Vector<F>, normal: Vector<F>, distance: F) -> F::Words {
+        let receiver_normal = self.pack.frames.z;
+        let squared = center.length_squared();
+        let near = squared.less(F::splat((NEAR_RADII * disc.radius).powi(2)));
+        let touched =
+            is_aligned(receiver_normal, normal) & distance.less(F::splat(self.walk.settings.bias * disc.radius));
+        let own = touched | is_own_surface(receiver_normal, normal, center, DISC_WIDTH * disc.radius);
+        let beside = squared - distance * distance;
+        let under = beside.less(F::splat((DISC_SCALE * disc.radius).powi(2)))
+            & distance.less(F::splat(UNDER_DEPTH * disc.radius));
+        let facing = F::splat(SAME_SHEET).less(normal.dot(receiver_normal));
+        let behind =
+            facing & F::splat(0.0).less(normal.dot(center)) & distance.less(F::splat(BEHIND_DEPTH * disc.radius));
+        near & (own | under | behind)
     }
 
     /// Adds what a two-sided element at `center` shows: the first of `sides` where the receiver is on the side of `normal`.
