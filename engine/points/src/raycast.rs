@@ -18,6 +18,30 @@ impl MeshScene {
     /// Casts `side` x `side` rays, cosine-weighted and stratified, from a receiver with unit `normal`. Every call with the
     /// same arguments gives the same answer; `seed` chooses the rays.
     pub fn raycast(&self, position: Vec3, normal: Vec3, side: u32, seed: u64) -> RayCast {
+        let (mut hits, mut sum) = (0u32, Vec3::ZERO);
+        self.for_each_ray(position, normal, side, seed, |ray| {
+            if let Some(radiance) = self.radiance_along(ray) {
+                hits += 1;
+                sum += radiance;
+            }
+        });
+        let rays = (side * side).max(1) as f32;
+        RayCast {
+            occlusion: hits as f32 / rays,
+            irradiance: (sum * (PI / rays)).to_array(),
+        }
+    }
+
+    /// The occlusion of [`Self::raycast`] alone, for which any hit will do.
+    pub fn raycast_occlusion(&self, position: Vec3, normal: Vec3, side: u32, seed: u64) -> f32 {
+        let mut hits = 0u32;
+        self.for_each_ray(position, normal, side, seed, |ray| {
+            hits += u32::from(self.occluded(ray, f32::INFINITY));
+        });
+        hits as f32 / (side * side).max(1) as f32
+    }
+
+    fn for_each_ray(&self, position: Vec3, normal: Vec3, side: u32, seed: u64, mut cast: impl FnMut(&Ray)) {
         let origin = position + normal * self.ray_offset(position);
         let (u, v) = normal.any_orthonormal_pair();
         let mut state = seed;
@@ -28,20 +52,11 @@ impl MeshScene {
             z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
             ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
         };
-        let (mut hits, mut sum) = (0u32, Vec3::ZERO);
         for cell in 0..side * side {
-            let share = (f32::from((cell / side) as u16) + random()) / side as f32;
+            let share = ((cell / side) as f32 + random()) / side as f32;
             let (sin, cos) = (2.0 * PI * ((cell % side) as f32 + random()) / side as f32).sin_cos();
             let direction = (u * cos + v * sin) * share.sqrt() + normal * (1.0 - share).max(0.0).sqrt();
-            if let Some(radiance) = self.radiance_along(&Ray { origin, direction }) {
-                hits += 1;
-                sum += radiance;
-            }
-        }
-        let rays = (side * side).max(1) as f32;
-        RayCast {
-            occlusion: hits as f32 / rays,
-            irradiance: (sum * (PI / rays)).to_array(),
+            cast(&Ray { origin, direction });
         }
     }
 

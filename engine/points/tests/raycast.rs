@@ -21,6 +21,7 @@ fn rays_from_the_middle_of_the_demo_see_its_floor_below_and_its_light_above() {
         scene.raycast(middle, Vec3::NEG_Y, 16, 1),
         "the same rays give the same answer"
     );
+    assert_eq!(down.occlusion, scene.raycast_occlusion(middle, Vec3::NEG_Y, 16, 1));
     let far = scene.raycast(Vec3::from(bounds.max) + Vec3::ONE, Vec3::ONE.normalize(), 8, 1);
     assert_eq!(far.occlusion, 0.0);
 }

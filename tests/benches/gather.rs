@@ -1,0 +1,327 @@
+//! Error against time, of the gather and of ray casting the mesh, on the same receivers in one run and on one core.
+//!
+//! `cargo bench -p pbgi-tests --bench gather -- [cornell] [sponza] [city] [forest]` (all by default; scenes whose files are
+//! absent are skipped, loudly). Errors are against rays at the mesh: two independent references per receiver, whose noise
+//! drops out of the mean of the product of both differences.
+
+#![allow(clippy::unwrap_used, reason = "a benchmark asserts")]
+
+use glam::Vec3;
+use pbgi_build::{BuildRequest, build};
+use pbgi_core::{BuildSettings, PageKind, PageNo, SceneInfo, ShadeSettings};
+use pbgi_points::{Camera, Density, GBuffer, InputOptions, Kind, MeshScene, ProceduralScene, open_input};
+use pbgi_shade::{ArraySource, Receiver, Shaded, Shader};
+use pbgi_store::{Overwrite, Scene};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::time::{Instant, SystemTime};
+
+/// Picture that the receivers are taken from.
+const SIZE: (u32, u32) = (960, 544);
+/// Edge of a group of receivers, as the worker shades them.
+const GROUP: u32 = 8;
+/// One group of so many is shaded.
+const GROUP_STEP: u32 = 61;
+/// Rays of each of the two references, along one edge of their grid.
+const REFERENCE_SIDE: u32 = 32;
+/// Settings of the gather: solid angle of a cut element, raster resolution.
+const SETTINGS: [(f32, u32); 7] = [
+    (0.5, 32),
+    (0.2, 32),
+    (0.1, 32),
+    (0.05, 32),
+    (0.1, 64),
+    (0.05, 64),
+    (0.02, 64),
+];
+/// Rays along one edge of the grid.
+const RAY_SIDES: [u32; 4] = [4, 8, 16, 32];
+
+/// One line of the table.
+struct Row {
+    what: String,
+    micros: f64,
+    occlusion: f64,
+    irradiance: f64,
+    note: String,
+}
+
+/// What the estimates are held against.
+struct Truth {
+    first: Vec<[f32; 2]>,
+    second: Vec<[f32; 2]>,
+    mean_irradiance: f64,
+}
+
+impl Truth {
+    fn new(mesh: &MeshScene, receivers: &[Receiver]) -> Self {
+        let cast = |salt: u64| -> Vec<[f32; 2]> {
+            let at = |(receiver, index): (&Receiver, u64)| {
+                let found = mesh.raycast(receiver.position, receiver.normal, REFERENCE_SIDE, salt << 40 | index);
+                [found.occlusion, mean(found.irradiance)]
+            };
+            receivers.iter().zip(0..).map(at).collect()
+        };
+        let (first, second) = std::thread::scope(|scope| {
+            let first = scope.spawn(|| cast(1));
+            (cast(2), first.join().unwrap())
+        });
+        let sum: f64 = first
+            .iter()
+            .zip(&second)
+            .map(|(a, b)| f64::from(a[1] + b[1]) / 2.0)
+            .sum();
+        Self {
+            mean_irradiance: sum / receivers.len() as f64,
+            first,
+            second,
+        }
+    }
+
+    /// RMS of occlusion, and of irradiance over its mean.
+    fn errors(&self, estimates: &[[f32; 2]]) -> (f64, f64) {
+        let rms = |channel: usize| {
+            let product = |(index, estimate): (usize, &[f32; 2])| {
+                let (a, b) = (self.first[index][channel], self.second[index][channel]);
+                f64::from(estimate[channel] - a) * f64::from(estimate[channel] - b)
+            };
+            let sum: f64 = estimates.iter().enumerate().map(product).sum();
+            (sum / estimates.len() as f64).max(0.0).sqrt()
+        };
+        (rms(0), rms(1) / self.mean_irradiance)
+    }
+}
+
+fn mean(rgb: [f32; 3]) -> f32 {
+    (rgb[0] + rgb[1] + rgb[2]) / 3.0
+}
+
+/// A built scene as plain arrays.
+fn load(path: &Path) -> (SceneInfo, ArraySource) {
+    let scene = Scene::open(path).unwrap();
+    let info = scene.info().clone();
+    let mut source = ArraySource::default();
+    for kind in [PageKind::Node, PageKind::Point] {
+        let mut page = vec![0u64; info.page_bytes(kind).div_ceil(8)];
+        for number in 0..info.page_count(kind) {
+            let bytes: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut page)[..info.page_bytes(kind)];
+            scene.read_page(kind, PageNo(number as u32), bytes).unwrap();
+            match kind {
+                PageKind::Node => source.nodes.extend_from_slice(bytemuck::cast_slice(bytes)),
+                PageKind::Point => source.points.extend_from_slice(bytemuck::cast_slice(bytes)),
+            }
+        }
+    }
+    source.points.truncate(info.point_count as usize);
+    (info, source)
+}
+
+/// Receivers in whole groups, spread over the picture.
+fn receivers(mesh: &MeshScene) -> Vec<Vec<Receiver>> {
+    let camera = mesh.camera(0).unwrap_or_else(|_| Camera::framing(&mesh.bounds()));
+    let (width, height) = SIZE;
+    let frame = GBuffer::render(mesh, &camera, width, height).unwrap();
+    let mut groups = Vec::new();
+    let columns = width / GROUP;
+    for group in (0..columns * (height / GROUP)).step_by(GROUP_STEP as usize) {
+        let (left, top) = (group % columns * GROUP, group / columns * GROUP);
+        let pixels = (0..GROUP * GROUP).map(|i| ((top + i / GROUP) * width + left + i % GROUP) as usize);
+        let seen = pixels.filter(|&pixel| !frame.is_hole(pixel)).map(|pixel| Receiver {
+            position: frame.position[pixel].into(),
+            normal: Vec3::from(frame.normal[pixel]).normalize(),
+        });
+        groups.push(seen.collect());
+    }
+    groups
+}
+
+fn gather_row(
+    info: &SceneInfo,
+    source: &mut ArraySource,
+    groups: &[Vec<Receiver>],
+    truth: &Truth,
+    row: (f32, u32),
+) -> Row {
+    let settings = ShadeSettings {
+        max_solid_angle: row.0,
+        raster_resolution: row.1,
+        ..ShadeSettings::default()
+    };
+    let mut shader = Shader::new(info, settings, None).unwrap();
+    let mut shaded: Vec<Vec<Shaded>> = groups
+        .iter()
+        .map(|group| vec![Shaded::default(); group.len()])
+        .collect();
+    let mut best = f64::INFINITY;
+    let mut counters = shader.counters();
+    for _ in 0..3 {
+        let before = shader.counters();
+        let start = Instant::now();
+        for (group, shaded) in groups.iter().zip(&mut shaded) {
+            shader.shade_group(group, source, shaded).unwrap();
+        }
+        best = best.min(start.elapsed().as_secs_f64());
+        counters = shader.counters();
+        counters.cut_elements -= before.cut_elements;
+        counters.receivers -= before.receivers;
+    }
+    let estimates: Vec<[f32; 2]> = shaded
+        .iter()
+        .flatten()
+        .map(|shaded| [shaded.occlusion, mean(shaded.irradiance)])
+        .collect();
+    let (occlusion, irradiance) = truth.errors(&estimates);
+    let count = counters.receivers as f64;
+    Row {
+        what: format!("gather, solid angle {}, raster {}", row.0, row.1),
+        micros: best * 1e6 / count,
+        occlusion,
+        irradiance,
+        note: format!(
+            "cut {:.0}, {:.0} ns an element",
+            counters.cut_elements as f64 / count,
+            best * 1e9 / counters.cut_elements as f64
+        ),
+    }
+}
+
+fn ray_rows(mesh: &MeshScene, receivers: &[Receiver], truth: &Truth, side: u32) -> [Row; 2] {
+    let seed = |index: usize| 3 << 40 | index as u64;
+    let start = Instant::now();
+    let occlusion = receivers.iter().enumerate().map(|(index, receiver)| {
+        let share = mesh.raycast_occlusion(receiver.position, receiver.normal, side, seed(index));
+        [share, 0.0]
+    });
+    let occlusion: Vec<[f32; 2]> = occlusion.collect();
+    let occlusion_micros = start.elapsed().as_secs_f64() * 1e6 / receivers.len() as f64;
+    let start = Instant::now();
+    let bounce = receivers.iter().enumerate().map(|(index, receiver)| {
+        let found = mesh.raycast(receiver.position, receiver.normal, side, seed(index));
+        [found.occlusion, mean(found.irradiance)]
+    });
+    let bounce: Vec<[f32; 2]> = bounce.collect();
+    let bounce_micros = start.elapsed().as_secs_f64() * 1e6 / receivers.len() as f64;
+    let rays = side * side;
+    [
+        Row {
+            what: format!("{rays} rays, occlusion alone"),
+            micros: occlusion_micros,
+            occlusion: truth.errors(&occlusion).0,
+            irradiance: f64::NAN,
+            note: String::new(),
+        },
+        Row {
+            what: format!("{rays} rays, one bounce"),
+            micros: bounce_micros,
+            occlusion: truth.errors(&bounce).0,
+            irradiance: truth.errors(&bounce).1,
+            note: String::new(),
+        },
+    ]
+}
+
+fn measure(name: &str, file: &Path, points: u64, scratch: &Path) {
+    let mesh = MeshScene::load(file).unwrap();
+    let groups = receivers(&mesh);
+    let all: Vec<Receiver> = groups.iter().flatten().copied().collect();
+    let truth = Truth::new(&mesh, &all);
+
+    let options = InputOptions {
+        density: Density::Points(points),
+        memory_bytes: 4_000_000_000,
+        scratch_dir: scratch.to_owned(),
+        ..InputOptions::default()
+    };
+    let mut input = open_input(&[file.to_owned()], &options).unwrap();
+    let output = scratch.join(format!("{name}.pbgi"));
+    let request = BuildRequest {
+        output: output.clone(),
+        overwrite: Overwrite::Refuse,
+        scratch_dir: scratch.to_owned(),
+        memory_bytes: 4_000_000_000,
+        settings: BuildSettings::default(),
+        input_key: None,
+    };
+    build(&mut input, &request, &mut |_| ControlFlow::Continue(())).unwrap();
+    let (info, mut source) = load(&output);
+
+    println!(
+        "\n{name}: {} triangles, {} points, {} receivers",
+        mesh.triangle_count(),
+        info.point_count,
+        all.len()
+    );
+    println!(
+        "{:<36} {:>12} {:>14} {:>14}",
+        "method", "us/receiver", "occlusion RMS", "indirect RMS"
+    );
+    let mut rows = Vec::new();
+    for row in SETTINGS {
+        rows.push(gather_row(&info, &mut source, &groups, &truth, row));
+    }
+    for side in RAY_SIDES {
+        rows.extend(ray_rows(&mesh, &all, &truth, side));
+    }
+    for row in rows {
+        let indirect = if row.irradiance.is_nan() {
+            String::new()
+        } else {
+            format!("{:.2} %", 100.0 * row.irradiance)
+        };
+        println!(
+            "{:<36} {:>12.1} {:>14.4} {:>14}   {}",
+            row.what, row.micros, row.occlusion, indirect, row.note
+        );
+    }
+}
+
+/// The scene's mesh, its points, or why it is skipped.
+fn scene(name: &str, scratch: &Path) -> Option<(PathBuf, u64)> {
+    match name {
+        "cornell" => Some((pbgi_tests::shared("reference/cornell.glb")?, 2_000_000)),
+        "sponza" => Some((pbgi_tests::shared("data/sponza/sponza_lit.gltf")?, 5_500_000)),
+        "city" | "forest" => {
+            let kind: Kind = name.parse().unwrap();
+            let path = scratch.join(format!("{name}.glb"));
+            ProceduralScene::new(kind, 2_000_000, 1)
+                .unwrap()
+                .write_glb(&path)
+                .unwrap();
+            Some((path, 2_000_000))
+        }
+        _ => panic!("{name:?} is no scene: choose cornell, sponza, city or forest"),
+    }
+}
+
+/// Days since the beginning of 1970.
+#[allow(clippy::disallowed_methods, reason = "a benchmark says when it was run")]
+fn day() -> u64 {
+    SystemTime::now()
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .unwrap()
+        .as_secs()
+        / 86_400
+}
+
+fn main() {
+    let given: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with("--")).collect();
+    let names = if given.is_empty() {
+        ["cornell", "sponza", "city", "forest"].map(str::to_owned).to_vec()
+    } else {
+        given
+    };
+    let processor = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = processor.lines().find(|line| line.starts_with("model name"));
+    println!("cargo bench -p pbgi-tests --bench gather -- {}", names.join(" "));
+    println!(
+        "{}; one core; day {} since 1970",
+        model.unwrap_or("unknown processor"),
+        day()
+    );
+    let scratch = tempfile::tempdir().unwrap();
+    for name in &names {
+        if let Some((file, points)) = scene(name, scratch.path()) {
+            measure(name, &file, points, scratch.path());
+        }
+    }
+}
