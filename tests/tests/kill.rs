@@ -88,6 +88,7 @@ fn shading(house: &House) -> Vec<i32> {
 }
 
 #[test]
+#[ignore = "minutes: cargo test --release -p pbgi-tests --test kill -- --ignored"]
 fn a_tile_that_kills_three_workers_fails_its_job_and_no_other() {
     let house = House::new();
     house.furnish(60_000, "32x32");
@@ -154,6 +155,7 @@ fn hung_workers(count: usize) {
 }
 
 #[test]
+#[ignore = "minutes: cargo test --release -p pbgi-tests --test kill -- --ignored"]
 fn a_hung_worker_is_killed_and_its_tile_done_by_another() {
     hung_workers(1);
 }
@@ -238,6 +240,7 @@ fn twenty_killed_daemons_leave_no_worker_and_no_partial_picture() {
 }
 
 #[test]
+#[ignore = "minutes: cargo test --release -p pbgi-tests --test kill -- --ignored"]
 fn a_daemon_killed_at_any_moment_of_its_start_leaves_at_most_a_segment_that_the_next_removes() {
     let house = House::new();
     house.furnish(2_000, "32x32");
@@ -270,6 +273,7 @@ fn a_daemon_killed_at_any_moment_of_its_start_leaves_at_most_a_segment_that_the_
 }
 
 #[test]
+#[ignore = "minutes: cargo test --release -p pbgi-tests --test kill -- --ignored"]
 fn a_segment_that_somebody_removes_lets_the_job_finish_and_the_daemon_leave() {
     let house = House::new();
     house.furnish(60_000, "128x128");
