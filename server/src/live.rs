@@ -1,6 +1,6 @@
 //! Shading of receivers that a client streams: cut into tiles of groups, handed out beside those of pictures, answered in order.
 //!
-//! A session holds at most [`limits::LIVE_TILES_MAX`] tiles between the stream and the answers; it does not read on before there
+//! A session holds at most `limits::LIVE_TILES_MAX` tiles between the stream and the answers; it does not read on before there
 //! is room. That bounds its memory and is all the back-pressure there is.
 
 use crate::framebuffer::TileReceivers;

@@ -366,7 +366,7 @@ impl Dispatcher {
     /// Counts the nodes of a scene by level. Blocks.
     ///
     /// # Errors
-    /// As [`Self::open_scene`], and a node page that is damaged.
+    /// As `open_scene`, and a node page that is damaged.
     pub fn scene_shape(&self, path: &Path) -> Result<SceneShape, JobError> {
         let shape = self.open_scene(path)?.scene().shape();
         shape.map_err(|error| JobError::new(JobErrorKind::Corrupt, error.to_string()))

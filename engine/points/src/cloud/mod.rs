@@ -1,4 +1,4 @@
-//! Point clouds as files have them: [`Cloud`], a stream whose points may lack normals or radii, and what all readers share.
+//! Point clouds as files have them: `Cloud`, a stream whose points may lack normals or radii, and what all readers share.
 
 pub(crate) mod las;
 pub(crate) mod ptc;
