@@ -1,6 +1,6 @@
 //! What is served to browsers and to Prometheus: a page, the JSON behind it, metrics, health. Everything is read-only.
 //!
-//! On a Unix socket always, on a loopback address if configured. Entry point: `serve`.
+//! On a Unix socket always, on a loopback address if configured. Entry points: [`serve_unix`], [`serve_tcp`].
 
 use crate::dispatcher::Dispatcher;
 use crate::error::ServerError;
