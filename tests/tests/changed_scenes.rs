@@ -86,7 +86,7 @@ fn a_scene_replaced_while_it_is_open_is_the_old_or_the_new_one() {
     let build = |input: &str, output: &str| {
         house
             .line(&format!(
-                "build {input} -o {output} --overwrite --nodes-per-page 64 --points-per-page 128 {TIGHT}"
+                "build {input} -o {output} --overwrite --nodes-per-page 64 --points-per-page 128 {DAEMON}"
             ))
             .ok();
     };

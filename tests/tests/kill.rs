@@ -77,9 +77,9 @@ fn a_killed_daemon_leaves_no_worker_no_picture_and_no_segment() {
     assert!(fresh[0].1.metadata().is_err(), "a segment outlived its daemon");
 }
 
-/// Workers that shade now, by process id.
+/// Workers that shade now, by process id; none before there is a daemon.
 fn shading(house: &House) -> Vec<i32> {
-    let status = house.line("status").ok().stdout;
+    let status = house.line("status").stdout;
     let workers = status
         .lines()
         .filter(|line| line.starts_with("worker") && line.contains(", shading"));
@@ -94,12 +94,13 @@ fn a_tile_that_kills_three_workers_fails_its_job_and_no_other() {
     house.furnish(60_000, "32x32");
     let line = |run: &str, quality: &str| format!("shade demo.pbgi --gbuffer g.exr -o {run}.exr {quality} {DAEMON}");
     house.line(&line("before", "")).ok();
-    // One tile, made slow. A fault's signal is what a worker gets that the tile itself brings down.
+    // One tile, made slow. A worker that the tile itself brings down ends by such a signal; a fault's own would be swallowed by
+    // the runtime's handler, which expects the fault to come again.
     let mut job = house.start(&line("poison", "--max-solid-angle 0.0001"));
     let mut deaths = 0;
     while job.runs() {
         for pid in shading(&house) {
-            signal(pid, Signal::SIGSEGV);
+            signal(pid, Signal::SIGABRT);
             assert!(
                 wait_for(WAIT, || !house.running("pbgi-worker").contains(&pid)),
                 "{pid} lives"
@@ -172,7 +173,7 @@ fn a_hundred_killed_workers_change_no_pixel_and_fail_no_job() {
     let house = House::new();
     house.furnish(60_000, "512x512");
     // Short tiles, so that some are done between two kills.
-    let line = |run: &str| format!("shade demo.pbgi --gbuffer g.exr -o {run}.exr --max-solid-angle 2 {DAEMON}");
+    let line = |run: &str| format!("shade demo.pbgi --gbuffer g.exr -o {run}.exr --max-solid-angle 1 {DAEMON}");
     let start = Instant::now();
     house.line(&line("calm")).ok();
     let calm = start.elapsed();
@@ -292,7 +293,7 @@ fn a_segment_that_somebody_removes_lets_the_job_finish_and_the_daemon_leave() {
     // What was leased was finished; the rest is for the next daemon.
     if run.code != Some(0) {
         run.fails_naming(&["error: "]);
-        house.line(&format!("{} --overwrite", line("removed"))).ok();
+        house.line(&line("removed")).ok();
     }
     assert_ne!(house.running("pbgi-server"), daemons);
     println!("RELIABILITY S4: the daemon left, the same picture");

@@ -188,9 +188,9 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         octant: u32,
         lanes: u8,
     ) {
-        let side = |bit: u32| if octant >> bit & 1 == 1 { 1.0f32 } else { -1.0 };
         // Away from the receivers.
-        let diagonal = Vec3::new(side(0), side(1), side(2)) * -1.0;
+        let side = |bit: u32| if octant >> bit & 1 == 1 { -1.0f32 } else { 1.0 };
+        let diagonal = Vec3::new(side(0), side(1), side(2));
         order.clear();
         order.extend(
             parts

@@ -386,7 +386,6 @@ mod avx2 {
     /// Whether this processor has what the module is compiled for.
     pub(super) fn is_available() -> bool {
         is_x86_feature_detected!("avx2")
-            && is_x86_feature_detected!("fma")
             && is_x86_feature_detected!("f16c")
             && is_x86_feature_detected!("bmi1")
             && is_x86_feature_detected!("bmi2")
