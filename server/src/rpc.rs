@@ -35,6 +35,7 @@ use tonic::service::InterceptorLayer;
 use tonic::transport::server::Connected;
 use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tonic_health::ServingStatus;
+use tonic_health::server::HealthReporter;
 
 /// How long a request may take that is no stream.
 const REQUEST_MAX: Duration = Duration::from_secs(30);
@@ -135,19 +136,13 @@ where
     let limit = limits::JOBS_MESSAGE_BYTES_MAX;
     let (health, health_service) = tonic_health::server::health_reporter();
     let mut healthy = dispatcher.health();
+    // Before the first call is answered: nobody must be told that a service is unknown.
+    let serving = *healthy.borrow_and_update();
+    publish_health(&health, serving).await;
     let report = tokio::spawn(async move {
-        loop {
-            let status = if *healthy.borrow_and_update() {
-                ServingStatus::Serving
-            } else {
-                ServingStatus::NotServing
-            };
-            for name in CLIENT_SERVICES.into_iter().chain([""]) {
-                health.set_service_status(name, status).await;
-            }
-            if healthy.changed().await.is_err() {
-                return;
-            }
+        while healthy.changed().await.is_ok() {
+            let serving = *healthy.borrow_and_update();
+            publish_health(&health, serving).await;
         }
     });
     let reflection = || {
@@ -188,6 +183,17 @@ where
         .await;
     report.abort();
     served.map_err(failed)
+}
+
+async fn publish_health(health: &HealthReporter, serving: bool) {
+    let status = if serving {
+        ServingStatus::Serving
+    } else {
+        ServingStatus::NotServing
+    };
+    for name in CLIENT_SERVICES.into_iter().chain([""]) {
+        health.set_service_status(name, status).await;
+    }
 }
 
 /// Serves workers until `stop` becomes true.
