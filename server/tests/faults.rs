@@ -120,8 +120,12 @@ async fn thousand_duplicate_submits_are_one_job() {
                 };
                 match client.submit_job(request).await {
                     Ok(job) => return job.into_inner().job_id,
-                    // More in flight than a connection may have: try again.
-                    Err(status) => assert_eq!(status.code(), Code::ResourceExhausted, "{status}"),
+                    // More in flight than a connection may have, refused by the service or, before
+                    // the client knew of the limit, by the transport: try again.
+                    Err(status) => assert!(
+                        matches!(status.code(), Code::ResourceExhausted | Code::Unavailable),
+                        "{status}"
+                    ),
                 }
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }
