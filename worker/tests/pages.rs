@@ -13,7 +13,7 @@ use std::thread::JoinHandle;
 
 const MOUNT: MountId = MountId { slot: 1, generation: 9 };
 const RECORDS_PER_PAGE: u32 = 16;
-const NODE_BYTES: usize = 112;
+const NODE_BYTES: usize = 116;
 const POINT_BYTES: usize = 32;
 /// Pages of each file but the last are full.
 const NODES: u64 = 16 * 20 - 3;

@@ -25,6 +25,8 @@ pub struct ClusterAccumulator {
     normal: DVec3,
     /// Sum of area times normal outer normal: xx, yy, zz, xy, xz, yz.
     normal_moment: [f64; 6],
+    /// Sums of area times radiance (mean of the channels), and times its square: front, back.
+    light: [[f64; 2]; 2],
     radius_max: f32,
     point_count: u64,
 }
@@ -47,6 +49,7 @@ impl Default for ClusterAccumulator {
             second_moment: [0.0; 6],
             normal: DVec3::ZERO,
             normal_moment: [0.0; 6],
+            light: [[0.0; 2]; 2],
             radius_max: 0.0,
             point_count: 0,
         }
@@ -88,6 +91,11 @@ impl ClusterAccumulator {
             self.second_moment[i] += area * (outer_position[i] + spread * (identity - outer_normal[i]));
             self.normal_moment[i] += area * outer_normal[i];
         }
+        for (sums, side) in self.light.iter_mut().zip([sides.front, sides.back]) {
+            let radiance = f64::from(side[0] + side[1] + side[2]) / 3.0;
+            sums[0] += area * radiance;
+            sums[1] += area * radiance * radiance;
+        }
         self.radius_max = self.radius_max.max(point.radius);
         self.point_count += 1;
     }
@@ -105,6 +113,9 @@ impl ClusterAccumulator {
         for i in 0..6 {
             self.second_moment[i] += child.second_moment[i];
             self.normal_moment[i] += child.normal_moment[i];
+        }
+        for (sums, other) in self.light.iter_mut().flatten().zip(child.light.iter().flatten()) {
+            *sums += other;
         }
         self.radius_max = self.radius_max.max(child.radius_max);
         self.point_count += child.point_count;
@@ -144,9 +155,24 @@ impl ClusterAccumulator {
                 0.0
             },
             covariance,
+            variation: self.variation(),
             sh,
         };
         FinalizedCluster { attributes, clamped }
+    }
+
+    /// See [`NodeAttributes::variation`].
+    fn variation(&self) -> f32 {
+        let [front, back] = self.light.map(|sums| {
+            let mean = sums[0] / self.area;
+            (mean, (sums[1] / self.area - mean * mean).max(0.0).sqrt())
+        });
+        let (brightest, deviation) = (front.0.max(back.0), front.1.max(back.1));
+        if deviation > 0.0 {
+            (deviation / brightest) as f32
+        } else {
+            0.0
+        }
     }
 
     /// Principal axis of the normals, on the side that most area faces: the dominant eigenvector of their second moment.
@@ -245,6 +271,7 @@ mod tests {
         assert!((node.covariance[0] - 1.0 / 12.0).abs() < 1e-3);
         assert!((node.covariance[1] - 1.0 / 12.0).abs() < 1e-3);
         assert!(node.covariance[2].abs() < 1e-6);
+        assert!(node.variation < 1e-3, "{}", node.variation);
     }
 
     #[test]
@@ -270,6 +297,20 @@ mod tests {
             "{}",
             back / area
         );
+    }
+
+    #[test]
+    fn variation_is_that_of_the_brighter_side() {
+        let mut points = wall([1.0; 3], [0.0; 3]);
+        points.extend(wall([3.0; 3], [0.0; 3]));
+        let variation =
+            |points: &[PointRecord]| summed(points).finalize(Voxel::ROOT, &quantizer()).attributes.variation;
+        assert!((variation(&points) - 0.5).abs() < 1e-3, "{}", variation(&points));
+        points.iter_mut().for_each(|point| {
+            *point = PointRecord::new(point.position, [0.0, 0.0, -1.0], point.radius, point.sides()).unwrap()
+        });
+        assert!((variation(&points) - 0.5).abs() < 1e-3, "{}", variation(&points));
+        assert_eq!(variation(&wall([0.0; 3], [0.0; 3])), 0.0);
     }
 
     #[test]

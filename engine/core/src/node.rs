@@ -1,4 +1,4 @@
-//! The node: a voxel's cluster as it lies in files and pages, 112 bytes.
+//! The node: a voxel's cluster as it lies in files and pages, 116 bytes.
 
 use crate::ids::{NodeIndex, PointIndex};
 use crate::limits::MORTON_BITS;
@@ -11,9 +11,9 @@ use half::f16;
 /// One octree node with its cluster.
 ///
 /// ```text
-/// byte 0          12      16     20       24       25     26     27      28           40                        112
-///      | centroid  | first | span | normal | level  |radius|spread| fill  | covariance | sh                     |
-///      | 3 x f32   | u32   | u32  | 2 x i16| + kind | code | code | code  | 6 x f16    | 9 x (area, r, g, b) f16|
+/// byte 0         12      16     20       24       25     26     27    28           40                       112         113 116
+///      | centroid | first | span | normal | level  |radius|spread| fill | covariance | sh                     | variation | zero|
+///      | 3 x f32  | u32   | u32  | 2 x i16| + kind | code | code | code | 6 x f16    | 9 x (area, r, g, b) f16| code      | 3 B |
 /// ```
 ///
 /// Siblings are contiguous and never cross a page, so a first child and a mask replace the paper's eight indices; the room
@@ -36,9 +36,11 @@ pub struct NodeRecord {
     /// Spherical harmonics, per term: projected front area and power in R, G, B, each divided by
     /// [`crate::pack::area_normaliser`] of the level.
     pub sh: [[f16; 4]; SH_TERMS],
+    variation_code: u8,
+    zero: [u8; 3],
 }
 
-const _: () = assert!(size_of::<NodeRecord>() == 112);
+const _: () = assert!(size_of::<NodeRecord>() == 116);
 
 /// What lies below a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,6 +83,8 @@ pub struct NodeAttributes {
     pub fill: f32,
     /// See [`NodeRecord::covariance`].
     pub covariance: [f32; 6],
+    /// See [`NodeRecord::variation`].
+    pub variation: f32,
     /// See [`NodeRecord::sh`], already normalised.
     pub sh: [[f16; 4]; SH_TERMS],
 }
@@ -92,6 +96,8 @@ const OVERFLOW_BIT: u8 = 0x40;
 const RADIUS_STEPS: f32 = 8.0;
 const RADIUS_ONE: f32 = 128.0;
 const FILL_STEPS: f32 = 64.0;
+/// Of shares from 0 to 1.
+const SHARE_STEPS: f32 = 255.0;
 
 impl NodeRecord {
     /// Packs a node at `level`.
@@ -115,10 +121,12 @@ impl NodeRecord {
             axis_code: octahedral::encode(attributes.axis),
             level_and_kind: level as u8 | bits,
             radius_code,
-            spread_code: (attributes.spread.clamp(0.0, 1.0) * 255.0).round() as u8,
+            spread_code: (attributes.spread.clamp(0.0, 1.0) * SHARE_STEPS).round() as u8,
             fill_code: (attributes.fill * FILL_STEPS).round().clamp(0.0, 255.0) as u8,
             covariance: attributes.covariance.map(f16::from_f32),
             sh: attributes.sh,
+            variation_code: (attributes.variation * SHARE_STEPS).ceil() as u8,
+            zero: [0; 3],
         }
     }
 
@@ -174,12 +182,18 @@ impl NodeRecord {
     /// Root mean square of the sine between the discs' normals and the axis: 0 for a flat cluster, 0.8 for a round one.
     #[inline]
     pub fn spread(&self) -> f32 {
-        f32::from(self.spread_code) / 255.0
+        f32::from(self.spread_code) / SHARE_STEPS
     }
 
     /// Area of the discs over the area in which the cluster's plane cuts the voxel; 4 and more are 4, unknown is 0.
     #[inline]
     pub fn fill(&self) -> f32 {
         f32::from(self.fill_code) / FILL_STEPS
+    }
+
+    /// Standard deviation of the radiance of a side over the mean of the brighter one, rounded up; 1 and more are 1.
+    #[inline]
+    pub fn variation(&self) -> f32 {
+        f32::from(self.variation_code) / SHARE_STEPS
     }
 }

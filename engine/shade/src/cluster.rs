@@ -20,6 +20,15 @@ const FLAT_THICKNESS: f32 = 0.06;
 /// A flat cluster that covers at least this share of its plane inside the voxel is drawn as the whole section. Sampling
 /// noise in small leaves makes the share uncertain by about as much as this is below 1.
 pub(crate) const SECTION_FILL: f32 = 0.7;
+/// A cluster whose normals spread less than this, that is thinner than [`EXACT_THICKNESS`] and covers its section to within
+/// [`EXACT_FILL`] has an exact footprint: only its light may be wrong, so it may be the larger the more even that is.
+const EXACT_SPREAD: f32 = 0.05;
+const EXACT_THICKNESS: f32 = 0.01;
+const EXACT_FILL: f32 = 0.08;
+/// Variation of light (standard deviation over mean) up to which the accepted solid angle grows ...
+const EVEN_VARIATION: f32 = 0.3;
+/// ... up to this many times.
+const STRETCH_MAX: f32 = 16.0;
 /// Share of the accepted solid angle at which clusters without a plane are accepted: their silhouette is a guess.
 const ROUND_SHARE: f32 = 0.2;
 /// Cosine between normals from which a disc is taken for the receiver's own surface.
@@ -62,6 +71,8 @@ pub(crate) struct Cluster<'a> {
     radius: f32,
     /// A piece of a plane.
     pub(crate) flat: bool,
+    /// How many times the accepted solid angle it may have.
+    stretch: f32,
     pub(crate) normaliser: f32,
 }
 
@@ -76,17 +87,26 @@ impl<'a> Cluster<'a> {
         }
         let normaliser = area_normaliser(edge);
         let across = quadratic_form(&covariance, axis).max(0.0).sqrt();
+        let (fill, spread) = (node.fill(), node.spread());
+        let flat = spread < FLAT_SPREAD && across < FLAT_THICKNESS * edge;
+        let exact = spread < EXACT_SPREAD && across < EXACT_THICKNESS * edge && (fill - 1.0).abs() < EXACT_FILL;
+        let stretch = if exact {
+            (EVEN_VARIATION / node.variation()).clamp(1.0, STRETCH_MAX)
+        } else {
+            1.0
+        };
         Self {
             node,
             centroid: node.centroid.into(),
             axis,
             covariance,
             area: node.sh[0][0].to_f32() * normaliser / AREA_TERM,
-            fill: node.fill(),
+            fill,
             edge,
-            spread: node.spread(),
+            spread,
             radius: node.radius_ratio() * edge,
-            flat: node.spread() < FLAT_SPREAD && across < FLAT_THICKNESS * edge,
+            flat,
+            stretch,
             normaliser,
         }
     }
@@ -110,11 +130,13 @@ impl<'a> Cluster<'a> {
         (of_voxel, of_points)
     }
 
-    /// Squared distance beyond which it may stand for what is below it.
+    /// Squared distance beyond which it may stand for what is below it, for all receivers and for those of whose surface it
+    /// is certainly no part.
     #[inline(always)]
-    pub(crate) fn accepted_from_squared(&self, max_solid_angle: f32) -> f32 {
+    pub(crate) fn accepted_from_squared(&self, max_solid_angle: f32) -> (f32, f32) {
         let share = if self.flat { 1.0 } else { ROUND_SHARE };
-        self.area.min(self.normaliser) / (share * max_solid_angle)
+        let from = self.area.min(self.normaliser) / (share * max_solid_angle);
+        (from, from / self.stretch)
     }
 
     /// The lanes in which a flat cluster is the receiver's own surface; `normal` is the receiver's, `centroid` and `center`

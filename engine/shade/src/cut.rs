@@ -151,8 +151,15 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
             lanes
         } else {
             let apart = F::splat(3.6 * visit.half * visit.half).less(center.length_squared());
-            let from = F::splat(cluster.accepted_from_squared(walk.settings.max_solid_angle));
-            lanes & (apart & from.less(centroid.length_squared())).lanes()
+            let (from, from_stretched) = cluster.accepted_from_squared(walk.settings.max_solid_angle);
+            let distance = centroid.length_squared();
+            let accepted = lanes & (apart & F::splat(from).less(distance)).lanes();
+            let stretched = lanes & !accepted & (apart & F::splat(from_stretched).less(distance)).lanes();
+            if stretched == 0 {
+                accepted
+            } else {
+                accepted | stretched & !cluster.own_surface(pack.frames.z, centroid, center)
+            }
         };
         if accepted != 0 {
             counters.cut_elements += u64::from(accepted.count_ones());

@@ -249,7 +249,7 @@ mod tests {
             // A big-endian writer.
             (8, &[0, 0, 0, 1], "needs 1", "has 16777216"),
             (12, &[2], "needs 1", "has 2"),
-            (16, &[120], "needs 112", "has 120"),
+            (16, &[120], "needs 116", "has 120"),
             (20, &[3, 0], "16..=131072", "has 3"),
         ];
         for (offset, patch, expected, actual) in cases {
