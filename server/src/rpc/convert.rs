@@ -2,10 +2,10 @@
 
 use crate::dispatcher::{DaemonStatus, TaskInfo};
 use crate::error::JobError;
-use crate::job::{BuildTask, Density, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
+use crate::job::{BuildTask, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
 use crate::shade_job::Counters;
 use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Facing, InvalidPoints, Radius, ViewDensity};
+use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, ViewDensity};
 use pbgi_proto::v1;
 use pbgi_store::{LevelShape, SceneShape};
 
@@ -16,18 +16,7 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
             output: task.output.into(),
             overwrite: task.overwrite,
             settings: build_settings(task.settings),
-            density: match task.density {
-                None => Density::Default,
-                Some(v1::build_task::Density::Spacing(spacing)) => Density::Spacing(spacing),
-                Some(v1::build_task::Density::Points(points)) => Density::Points(points),
-                Some(v1::build_task::Density::View(view)) => Density::View(ViewDensity {
-                    camera: view.camera as usize,
-                    size: [view.width, view.height],
-                    pixels: view.pixels,
-                    floor: view.floor,
-                    ceiling: view.ceiling,
-                }),
-            },
+            density: task.density.map(density),
             cloud: cloud(task.cloud.unwrap_or_default())?,
         })),
         Some(v1::submit_job_request::Task::Shade(task)) => Ok(Request::Shade(ShadeTask {
@@ -40,6 +29,20 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
             workers: (task.workers > 0).then_some(task.workers as usize),
         })),
         None => Err(JobError::invalid("the request has no task")),
+    }
+}
+
+fn density(density: v1::build_task::Density) -> Density {
+    match density {
+        v1::build_task::Density::Spacing(spacing) => Density::Spacing(spacing),
+        v1::build_task::Density::Points(points) => Density::Points(points),
+        v1::build_task::Density::View(view) => Density::View(ViewDensity {
+            camera: view.camera as usize,
+            size: [view.width, view.height],
+            pixels: view.pixels,
+            floor: view.floor,
+            ceiling: view.ceiling,
+        }),
     }
 }
 
