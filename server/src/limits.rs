@@ -85,6 +85,8 @@ pub const TICK: Duration = Duration::from_millis(200);
 pub const DRAIN_MAX: Duration = Duration::from_secs(30);
 /// How long connections may take to end when the daemon stops.
 pub const DISCONNECT_MAX: Duration = Duration::from_secs(2);
+/// The same when it was told twice to stop.
+pub const DISCONNECT_NOW_MAX: Duration = Duration::from_millis(200);
 
 /// Smallest and longest pause before a worker that died before it was ready is started again.
 pub const BACKOFF: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(5)];

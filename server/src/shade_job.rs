@@ -166,13 +166,13 @@ fn read(
 ) -> Result<(Shading, u64), String> {
     // Said now, not after the work is done.
     let text = |error: JobError| error.text;
-    let output = dispatcher.roots.write(&task.output, task.overwrite).map_err(text)?;
+    let output = dispatcher.roots().write(&task.output, task.overwrite).map_err(text)?;
     if !task.overwrite && std::fs::symlink_metadata(&output.path).is_ok() {
         let path = task.output.clone();
         return Err(StoreError::Exists { path }.to_string());
     }
     let mounted = dispatcher.open_scene(&task.scene).map_err(text)?;
-    let places = |path: &PathBuf| dispatcher.roots.read(path).map_err(text);
+    let places = |path: &PathBuf| dispatcher.roots().read(path).map_err(text);
     let gbuffer_place = places(&task.gbuffer)?;
     let environment_place = task.environment.as_ref().map(places).transpose()?;
     let environment = task
@@ -267,7 +267,7 @@ pub async fn write(
         statistics: statistics.clone(),
         scratch: dispatcher.config.options.scratch_dir.clone(),
         place: dispatcher
-            .roots
+            .roots()
             .write(&task.output, task.overwrite)
             .map_err(|error| error.text)?,
     };

@@ -22,9 +22,9 @@ impl Dispatcher {
         task.settings
             .validate()
             .map_err(|error| JobError::invalid(error.to_string()))?;
-        self.roots.check("scene", &task.scene, Want::Read)?;
+        self.roots().check("scene", &task.scene, Want::Read)?;
         if let Some(path) = &task.environment {
-            self.roots.check("environment", path, Want::Read)?;
+            self.roots().check("environment", path, Want::Read)?;
         }
         let (this, paths) = (self.clone(), task.clone());
         let opened = tokio::task::spawn_blocking(move || {
