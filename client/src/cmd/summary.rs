@@ -2,6 +2,7 @@
 
 use super::failure::Failure;
 use super::files;
+use pbgi_client::Client;
 use pbgi_client::size::scaled_bytes;
 use pbgi_core::Statistics;
 use pbgi_core::statistics::{Row, Unit};
@@ -46,6 +47,26 @@ pub(crate) fn json(statistics: &Statistics) -> String {
     debug_assert!(written.is_ok());
     bytes.push(b'\n');
     String::from_utf8_lossy(&bytes).into_owned()
+}
+
+/// JSON for people and programs. What commands print are plain records: they have no map keys and numbers that JSON lacks.
+pub(crate) fn pretty(value: &impl serde::Serialize) -> String {
+    serde_json::to_string_pretty(value).unwrap_or_default()
+}
+
+/// JSON of what daemons answered, each with its address.
+pub(crate) fn at_address<T: serde::Serialize>(answers: &[(Client, T)]) -> String {
+    #[derive(serde::Serialize)]
+    struct Answer<'a, T> {
+        address: &'a str,
+        #[serde(flatten)]
+        answer: &'a T,
+    }
+    let answers = answers.iter().map(|(client, answer)| Answer {
+        address: client.address(),
+        answer,
+    });
+    pretty(&answers.collect::<Vec<_>>())
 }
 
 /// Counts are written without a fraction; what is not a number does not apply.

@@ -36,11 +36,14 @@ mod sample;
 mod texture_file;
 mod trace;
 
-pub use crate::image::{Channel, LayeredImage, Precision, ToneMap, Window, read_environment, write_png};
+pub use crate::image::{
+    Attributes, Channel, Difference, LayerDifference, LayeredImage, Precision, ToneMap, Window, read_environment,
+    write_png,
+};
 pub use camera::Camera;
 pub use cloud::{CloudOptions, Facing, InvalidPoints, Radius};
 pub use error::PointsError;
-pub use gbuffer::{GBuffer, GBufferChannels};
+pub use gbuffer::{GBuffer, GBufferOptions, PassThrough, Space};
 pub use light::{Light, LightKind};
 pub use open::{Density, Input, InputOptions, SampleOptions, ViewDensity, open_input, origin_of};
 pub use ply::{PlyForm, write_point_ply};
