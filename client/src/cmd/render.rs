@@ -4,7 +4,7 @@ use super::args::{CameraArgs, DensityArgs, OutputArgs, QualityArgs, ServerArgs, 
 use super::composite::composite;
 use super::failure::Failure;
 use super::files::{self, Existing};
-use super::frame;
+use super::frame::{self, Frame};
 use super::interrupt::Interrupt;
 use super::look::{ExposureArgs, Look, LookArgs};
 use super::progress::Progress;
@@ -29,7 +29,7 @@ The built scene stays in XDG_CACHE_HOME/pbgi/scenes, keyed by the mesh and its s
 #[derive(Args, Debug)]
 #[command(after_help = RENDER_EXAMPLES)]
 pub(crate) struct RenderArgs {
-    /// A mesh with lights: .glb, .gltf, .obj
+    /// A mesh with lights (.glb, .gltf, .obj, .ply with faces) or a scene file (.toml)
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     #[command(flatten)]
@@ -137,7 +137,7 @@ async fn picture(plan: &Plan, server: &ServerArgs, stats: &StatsArgs, interrupt:
         let mut progress = Progress::new();
         progress.stage("rendering the G-buffer");
         let (input, camera) = (plan.input.clone(), plan.camera);
-        let gbuffer = interrupt.blocking(move || frame::render(&input, camera)).await?;
+        let Frame { gbuffer, environment } = interrupt.blocking(move || frame::render(&input, camera)).await?;
         let passes = folder.path().join("gbuffer.exr");
         gbuffer.write(&passes)?;
         let client = session::connect(server, interrupt, &progress).await?;
@@ -154,7 +154,7 @@ async fn picture(plan: &Plan, server: &ServerArgs, stats: &StatsArgs, interrupt:
             output: shaded.clone(),
             overwrite: false,
             settings: plan.settings,
-            environment: plan.environment.clone(),
+            environment: plan.environment.clone().or(environment),
             workers: server.job_workers(),
         };
         let shading = session::run(&client, &Work::Shade(job), interrupt, &mut progress).await?;

@@ -27,6 +27,11 @@ impl Camera {
         } else {
             Vec3::Y
         };
+        Self::looking(eye, target, up, fov_y)
+    }
+
+    /// The same, with another direction up that is not along the view.
+    pub(crate) fn looking(eye: Vec3, target: Vec3, up: Vec3, fov_y: f32) -> Self {
         Self {
             name: None,
             world_from_camera: Mat4::from_translation(eye) * rotation_to(target - eye, up),

@@ -1,6 +1,6 @@
 //! Where points come from, and what pictures are made of.
 //!
-//! [`open_input`] turns files into one stream of lit points: meshes ([`MeshScene`]: glTF, OBJ) are sampled evenly and lit by
+//! [`open_input`] turns files into one stream of lit points: meshes ([`MeshScene`]: glTF, OBJ, PLY, scene files) are sampled evenly and lit by
 //! their lights with shadow rays, clouds ([`cloud`]: PLY, LAS, LAZ, COPC, PTC, built scenes) are read as they are, with
 //! normals and radii estimated where they have none. [`GBuffer`] says what a camera sees, rendered from a
 //! mesh or read from another renderer's EXR passes. [`image`] writes the pictures. [`demo`] makes a scene on the spot, [`procedural`] one of any
@@ -33,6 +33,7 @@ mod obj_file;
 mod open;
 mod output;
 mod sample;
+mod scene_file;
 mod texture_file;
 mod trace;
 
@@ -51,3 +52,4 @@ pub use procedural::{Kind, ProceduralScene};
 pub use raycast::RayCast;
 pub use sample::MeshPoints;
 pub use scene::MeshScene;
+pub use scene_file::scene_meshes;

@@ -32,6 +32,9 @@ pub const EXR_PARTS_MAX: usize = 64;
 /// Edge of the tiles of EXR files that we write, pixels: the tiles of the work queue.
 pub const EXR_TILE_EDGE: usize = pbgi_core::limits::TILE_EDGE as usize;
 
+/// Most bytes of a scene file: hundreds of thousands of placed meshes.
+pub const SCENE_FILE_BYTES_MAX: u64 = 64 << 20;
+
 /// Most bytes of a PLY header.
 pub const PLY_HEADER_BYTES_MAX: u64 = 1 << 16;
 
