@@ -2,7 +2,7 @@
 
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
 use pbgi_points::{CloudOptions, Density, GBufferOptions};
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -121,6 +121,7 @@ pub struct Job {
     /// Why it failed; empty otherwise.
     pub error: String,
     /// Complete when the job is.
+    #[serde(serialize_with = "serialize_statistics")]
     pub statistics: Statistics,
     /// What the job does, for people.
     pub title: String,
@@ -128,6 +129,25 @@ pub struct Job {
     pub options: JobOptions,
     /// What happened to it, oldest first.
     pub history: Vec<JobEvent>,
+}
+
+/// Largest integer that a JSON number holds exactly.
+const EXACT_MAX: f64 = 9_007_199_254_740_992.0;
+
+/// Every row by name, in the table's order: counts without a fraction, `null` where a row does not apply.
+///
+/// # Errors
+/// Those of the serializer.
+pub fn serialize_statistics<S: Serializer>(statistics: &Statistics, serializer: S) -> Result<S::Ok, S::Error> {
+    let number = |value: Option<f64>| match value {
+        Some(value) if value.fract() == 0.0 && (0.0..=EXACT_MAX).contains(&value) => {
+            serde_json::Value::from(value as u64)
+        }
+        // What is not a number does not apply.
+        Some(value) => serde_json::Value::from(value),
+        None => serde_json::Value::Null,
+    };
+    serializer.collect_map(statistics.rows().iter().map(|row| (row.name, number(row.value))))
 }
 
 /// The daemon as it reports itself.
