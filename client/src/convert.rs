@@ -4,7 +4,7 @@ use crate::job::{
     BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
 };
 use pbgi_core::{Bounds, BuildId, BuildSettings, NodeIndex, Quantizer, SceneInfo, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius};
+use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, Space};
 use pbgi_proto::v1;
 use std::path::Path;
 
@@ -39,6 +39,14 @@ pub(crate) fn shade_task(job: &ShadeJob) -> Result<v1::ShadeTask, String> {
         settings: Some(wire_shade_settings(&job.settings)),
         environment: job.environment.as_deref().map(text).transpose()?.unwrap_or_default(),
         workers: job.workers.unwrap_or(0),
+        position: job.passes.position.clone().unwrap_or_default(),
+        normal: job.passes.normal.clone().unwrap_or_default(),
+        space: match job.passes.space {
+            Space::Checked => v1::Space::Checked,
+            Space::World => v1::Space::World,
+            Space::Camera => v1::Space::Camera,
+        }
+        .into(),
     })
 }
 

@@ -17,6 +17,9 @@ pub mod size;
 pub use cache::{CachePins, CachePool, CacheStatus, CachedFile, CachedScene, Lookups};
 pub use client::Client;
 pub use error::{ClientError, Refusal};
-pub use job::{BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
+pub use job::{
+    BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
+    serialize_statistics,
+};
 pub use pbgi_points::{CloudOptions, Density};
 pub use shape::{LevelShape, SceneShape};

@@ -5,7 +5,7 @@ use crate::limits;
 use crate::roots::{Roots, Want};
 use crate::scheduler::{JobNo, Kind};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Density};
+use pbgi_points::{CloudOptions, Density, GBufferOptions};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
@@ -35,6 +35,8 @@ pub struct ShadeTask {
     pub scene: PathBuf,
     /// The G-buffer, absolute.
     pub gbuffer: PathBuf,
+    /// How it is read.
+    pub passes: GBufferOptions,
     /// The picture, absolute.
     pub output: PathBuf,
     /// Whether a picture that is there is replaced.

@@ -126,6 +126,8 @@ pub const SEGMENT_SHARE: f64 = 0.5;
 pub const BUILD_BYTES_MIN: u64 = 72 << 20;
 /// Bytes that one pixel of a picture takes at its peak, which is when it is written (113 measured at 1920 x 1080).
 pub const PICTURE_BYTES_PER_PIXEL: u64 = 116;
+/// Bytes of a pixel in a channel that goes from the G-buffer to the picture as it is.
+pub const PASSED_BYTES_PER_PIXEL: u64 = 4;
 /// Share of a machine's limit that is taken without being asked to, and the most of a container's limit.
 pub const LIMIT_SHARE: f64 = 0.8;
 

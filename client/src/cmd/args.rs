@@ -7,7 +7,7 @@ use pbgi_client::JobOptions;
 use pbgi_client::private::PrivateOptions;
 use pbgi_client::size::parse_bytes;
 use pbgi_core::{BuildSettings, ShadeSettings, limits};
-use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, ViewDensity};
+use pbgi_points::{CloudOptions, Density, Facing, GBufferOptions, InvalidPoints, Radius, Space, ViewDensity};
 use std::path::PathBuf;
 
 /// Which daemon.
@@ -45,6 +45,14 @@ pub(crate) struct RunningArgs {
     /// The daemon's address, unix:/path/to/jobs.sock; without it, your private daemons
     #[arg(long, value_name = "URI")]
     pub(crate) server: Option<String>,
+}
+
+/// How answers are printed.
+#[derive(Args, Clone, Copy, Debug, Default)]
+pub(crate) struct FormArgs {
+    /// Print JSON instead of a table
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 /// Where results go.
@@ -240,6 +248,41 @@ impl QualityArgs {
     }
 }
 
+/// How a G-buffer is read.
+#[derive(Args, Debug)]
+#[command(next_help_heading = "G-buffer")]
+pub(crate) struct PassArgs {
+    /// Layer of the positions [default: found by its usual names: P, Pworld, WP, position, ViewLayer.Position, ...]
+    #[arg(long, value_name = "LAYER")]
+    position: Option<String>,
+    /// Layer of the normals [default: found by its usual names: N, Nworld, normal, normals, ViewLayer.Normal, ...]
+    #[arg(long, value_name = "LAYER")]
+    normal: Option<String>,
+    /// Space of both: checked (world space, refused if it is plainly a camera's), world (not checked), or camera (converted
+    /// with the file's worldToCamera)
+    #[arg(long, value_name = "SPACE", default_value = "checked", value_parser = space)]
+    space: Space,
+}
+
+impl PassArgs {
+    pub(crate) fn options(&self) -> GBufferOptions {
+        GBufferOptions {
+            position: self.position.clone(),
+            normal: self.normal.clone(),
+            space: self.space,
+        }
+    }
+}
+
+fn space(text: &str) -> Result<Space, String> {
+    match text {
+        "checked" => Ok(Space::Checked),
+        "world" => Ok(Space::World),
+        "camera" => Ok(Space::Camera),
+        _ => Err("write checked, world or camera".to_owned()),
+    }
+}
+
 /// How octrees are built.
 #[derive(Args, Debug, Default)]
 #[command(next_help_heading = "Octree")]
@@ -309,7 +352,7 @@ pub(crate) fn picture_size(text: &str) -> Result<Size, String> {
     Ok(size)
 }
 
-fn positive(text: &str) -> Result<f32, String> {
+pub(crate) fn positive(text: &str) -> Result<f32, String> {
     match text.parse::<f32>() {
         Ok(value) if value > 0.0 && value.is_finite() => Ok(value),
         _ => Err("it must be a number above 0".to_owned()),

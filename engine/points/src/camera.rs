@@ -1,7 +1,10 @@
 //! Cameras: where primary rays start.
 
-use glam::{DMat4, DVec3, Mat4, Vec3};
+use glam::{DMat4, DVec3, DVec4, Mat4, Vec3};
 use pbgi_core::Bounds;
+
+/// Distance at which the depth of `worldToNDC` begins, world units: our cameras have no near plane, but the matrix wants one.
+const NDC_NEAR: f64 = 0.01;
 
 /// A perspective camera in glTF's convention: it looks along its own -z, y up.
 #[derive(Clone, Debug, PartialEq)]
@@ -24,6 +27,11 @@ impl Camera {
         } else {
             Vec3::Y
         };
+        Self::looking(eye, target, up, fov_y)
+    }
+
+    /// The same, with another direction up that is not along the view.
+    pub(crate) fn looking(eye: Vec3, target: Vec3, up: Vec3, fov_y: f32) -> Self {
         Self {
             name: None,
             world_from_camera: Mat4::from_translation(eye) * rotation_to(target - eye, up),
@@ -61,10 +69,28 @@ impl Camera {
         direction.normalize().as_vec3()
     }
 
+    /// The EXR attribute `worldToNDC` (column vectors) of a picture of `width` by `height` pixels: after the division by w, x
+    /// and y are 0 at the upper left and 1 at the lower right corner; z is 0 at a distance of 0.01 and 1 infinitely far.
+    pub fn exr_world_to_ndc(&self, width: u32, height: u32) -> Mat4 {
+        let across = 2.0 * f64::from(self.fov_y / 2.0).tan();
+        let aspect = f64::from(width) / f64::from(height);
+        let ndc_from_camera = DMat4::from_cols(
+            DVec4::new(1.0 / (across * aspect), 0.0, 0.0, 0.0),
+            DVec4::new(0.0, -1.0 / across, 0.0, 0.0),
+            DVec4::new(0.5, 0.5, 1.0, 1.0),
+            DVec4::new(0.0, 0.0, -NDC_NEAR, 0.0),
+        );
+        (ndc_from_camera * self.left_handed()).as_mat4()
+    }
+
     /// The EXR attribute `worldToCamera` (column vectors): left-handed, +z along the view.
     pub fn exr_world_to_camera(&self) -> Mat4 {
+        self.left_handed().as_mat4()
+    }
+
+    fn left_handed(&self) -> DMat4 {
         let camera_from_world = self.world_from_camera.as_dmat4().inverse();
-        (DMat4::from_scale(DVec3::new(1.0, 1.0, -1.0)) * camera_from_world).as_mat4()
+        DMat4::from_scale(DVec3::new(1.0, 1.0, -1.0)) * camera_from_world
     }
 }
 
@@ -87,6 +113,24 @@ mod tests {
         assert!(direction.distance(Vec3::new(-5.0, -2.0, -2.0).normalize()) < 1e-6);
         let above = camera.direction(50, 0, 101, 101);
         assert!(above.y > direction.y, "row 0 is at the top");
+    }
+
+    #[test]
+    fn ndc_runs_from_the_upper_left_to_the_lower_right_corner() {
+        let camera = Camera::look_at(Vec3::new(1.0, 2.0, 3.0), Vec3::new(-4.0, 0.0, 1.0), 0.8);
+        let matrix = camera.exr_world_to_ndc(64, 48);
+        for (column, row) in [(0, 0), (63, 0), (0, 47), (31, 23), (63, 47)] {
+            let seen = camera.eye() + camera.direction(column, row, 64, 48) * 7.0;
+            let ndc = matrix.project_point3(seen);
+            let expected = [(column as f32 + 0.5) / 64.0, (row as f32 + 0.5) / 48.0];
+            assert!(
+                (ndc.x - expected[0]).abs() < 1e-5 && (ndc.y - expected[1]).abs() < 1e-5,
+                "{ndc}"
+            );
+            assert!(ndc.z > 0.0 && ndc.z < 1.0, "{ndc}");
+        }
+        let behind = matrix * (camera.eye() * 2.0 - Vec3::new(-4.0, 0.0, 1.0)).extend(1.0);
+        assert!(behind.w < 0.0, "what lies behind has no place");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::cloud::{Cloud, CloudOptions, Missing, Radius};
 use crate::error::PointsError;
 use crate::estimate::{Estimated, Means};
 use crate::limits;
-use crate::ply::PlyPoints;
+use crate::ply::{self, PlyPoints};
 use crate::sample::MeshPoints;
 use crate::scene::MeshScene;
 use pbgi_core::{Bounds, PointRecord, PointStream};
@@ -114,7 +114,7 @@ enum Kind {
     Scene,
 }
 
-/// Opens files as one stream of points. Mesh files (`.gltf`, `.glb`, `.obj`) are put into one scene, so that each is lit
+/// Opens files as one stream of points. Mesh files (`.gltf`, `.glb`, `.obj`, `.ply` with faces, scene files `.toml`) are put into one scene, so that each is lit
 /// by the lights and shadowed by the surfaces of all; they come first, then the clouds (`.ply`, `.las`, `.laz`, `.ptc`, and
 /// the points of built scenes, `.pbgi`) in the order given, those last whose normals or radii are estimated: they come in
 /// Z-order, all files that lack the same together.
@@ -211,7 +211,8 @@ fn of_kind<'a>(kinds: &[(Kind, &'a Path)], wanted: Kind) -> Vec<&'a Path> {
 
 fn kind(path: &Path) -> Result<Kind, PointsError> {
     Ok(match extension(path).as_str() {
-        "gltf" | "glb" | "obj" => Kind::Mesh,
+        "gltf" | "glb" | "obj" | "toml" => Kind::Mesh,
+        "ply" if ply::mesh::has_faces(path)? => Kind::Mesh,
         "ply" => Kind::Ply,
         "las" | "laz" => Kind::Las,
         "ptc" => Kind::Ptc,
@@ -221,7 +222,7 @@ fn kind(path: &Path) -> Result<Kind, PointsError> {
             return Err(PointsError::unsupported(
                 path,
                 what,
-                "convert it to .glb, .gltf, .obj, .ply, .las, .laz or .ptc",
+                "convert it to .glb, .gltf, .obj, .ply, .las, .laz or .ptc, or describe it in a scene file, .toml",
             ));
         }
     })

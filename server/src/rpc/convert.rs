@@ -5,7 +5,7 @@ use crate::error::JobError;
 use crate::job::{BuildTask, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
 use crate::shade_job::Counters;
 use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, ViewDensity};
+use pbgi_points::{CloudOptions, Density, Facing, GBufferOptions, InvalidPoints, Radius, Space, ViewDensity};
 use pbgi_proto::v1;
 use pbgi_store::{LevelShape, SceneShape};
 
@@ -20,6 +20,7 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
             cloud: cloud(task.cloud.unwrap_or_default())?,
         })),
         Some(v1::submit_job_request::Task::Shade(task)) => Ok(Request::Shade(ShadeTask {
+            passes: passes(&task)?,
             scene: task.scene.into(),
             gbuffer: task.gbuffer.into(),
             output: task.output.into(),
@@ -59,6 +60,20 @@ pub(super) fn options(options: Option<v1::JobOptions>, caller: &str) -> JobOptio
         after: given.after,
         paused: given.paused,
     }
+}
+
+fn passes(task: &v1::ShadeTask) -> Result<GBufferOptions, JobError> {
+    let layer = |name: &String| (!name.is_empty()).then(|| name.clone());
+    Ok(GBufferOptions {
+        position: layer(&task.position),
+        normal: layer(&task.normal),
+        space: match v1::Space::try_from(task.space) {
+            Ok(v1::Space::Checked) => Space::Checked,
+            Ok(v1::Space::World) => Space::World,
+            Ok(v1::Space::Camera) => Space::Camera,
+            Err(unknown) => return Err(JobError::invalid(format!("space is {unknown}"))),
+        },
+    })
 }
 
 fn cloud(given: v1::CloudSettings) -> Result<CloudOptions, JobError> {

@@ -220,6 +220,7 @@ pub(crate) fn write_gbuffer(path: &Path, width: u32, height: u32) -> GBuffer {
         data_window: window,
         display_window: window,
         world_to_camera: None,
+        world_to_ndc: None,
         position: (0..pixels).map(place).collect(),
         normal: vec![[0.0, 0.0, 1.0]; pixels],
         coverage: (0..pixels).map(|index| if hole(index) { 0.0 } else { 1.0 }).collect(),
