@@ -1,8 +1,11 @@
-//! The G-buffer: what the camera sees in each pixel, rendered from a mesh or read from another renderer's passes.
+//! The G-buffer: what the camera sees in each pixel, rendered from a mesh, put together from what rays
+//! met in a scene, or read from another renderer's passes.
 
+mod hits;
 mod read;
 mod render;
 
+pub use hits::{HitBuffer, RayHit};
 pub use read::GBufferChannels;
 
 use crate::error::PointsError;
