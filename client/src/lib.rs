@@ -10,6 +10,7 @@ mod client;
 mod convert;
 mod error;
 mod job;
+mod live;
 pub mod private;
 mod shape;
 pub mod size;
@@ -18,5 +19,6 @@ pub use cache::{CachePins, CachePool, CacheStatus, CachedFile, CachedScene, Look
 pub use client::Client;
 pub use error::{ClientError, Refusal};
 pub use job::{BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
+pub use live::{LIVE_RECEIVERS_MAX, LiveJob};
 pub use pbgi_points::{CloudOptions, Density};
 pub use shape::{LevelShape, SceneShape};

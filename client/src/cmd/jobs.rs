@@ -1,14 +1,16 @@
 //! `build`, `shade`, and what is done with jobs: `jobs`, `watch`, `cancel`.
 
 use super::args::{
-    CloudArgs, DensityArgs, JobArgs, OctreeArgs, OutputArgs, QualityArgs, RunningArgs, ServerArgs, StatsArgs,
+    CloudArgs, DensityArgs, JobArgs, OctreeArgs, OutputArgs, QualityArgs, RunningArgs, SeenArgs, ServerArgs, StatsArgs,
 };
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
 use super::progress::Progress;
+use super::render::temporary_folder;
 use super::session::{self, Work};
 use super::summary;
+use super::view::Seen;
 use clap::Args;
 use pbgi_client::{BuildJob, Job, JobState, ShadeJob};
 use std::path::PathBuf;
@@ -66,10 +68,11 @@ pub(crate) async fn build(args: BuildArgs, interrupt: &Interrupt) -> Result<(), 
 }
 
 const SHADE_EXAMPLES: &str = "\
-Example:
+Examples:
   pbgi-client shade hall.pbgi --gbuffer passes.exr -o indirect.exr --environment sky.hdr
+  pbgi-client shade town.pbgi --camera auto -o indirect.exr
 
-The G-buffer is an EXR file with world-space P and N. The output has the layers indirect (irradiance), occlusion (0 open,
+Without a G-buffer, what the camera sees is found among the points. The G-buffer is an EXR file with world-space P and N. The output has the layers indirect (irradiance), occlusion (0 open,
 1 closed) and bentnormal; the root R, G, B equal indirect.";
 
 /// `shade`
@@ -81,9 +84,11 @@ pub(crate) struct ShadeArgs {
     scene: PathBuf,
     /// World-space positions and normals of the pixels, an EXR file
     #[arg(long, value_name = "G.exr")]
-    gbuffer: PathBuf,
+    gbuffer: Option<PathBuf>,
     #[command(flatten)]
     output: OutputArgs,
+    #[command(flatten)]
+    seen: SeenArgs,
     #[command(flatten)]
     quality: QualityArgs,
     #[command(flatten)]
@@ -96,15 +101,44 @@ pub(crate) struct ShadeArgs {
 
 pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), Failure> {
     let existing = Existing::from_flag(args.output.overwrite);
+    let folder;
+    let gbuffer = match (&args.gbuffer, args.seen.is_given()) {
+        (Some(path), false) => files::input(path)?,
+        (None, true) if !args.job.detach => {
+            folder = temporary_folder()?;
+            folder.path().join("gbuffer.exr")
+        }
+        (None, true) => {
+            return Err(Failure::usage(
+                "--detach is for a G-buffer that is there: give --gbuffer",
+            ));
+        }
+        _ => {
+            return Err(Failure::usage(
+                "give either --gbuffer or a camera: --camera, --camera-file or --eye",
+            ));
+        }
+    };
     let job = ShadeJob {
         settings: args.quality.settings()?,
         scene: files::input(&args.scene)?,
-        gbuffer: files::input(&args.gbuffer)?,
+        gbuffer,
         output: files::output_of_kind(&args.output.output, existing, "exr")?,
         overwrite: existing.replaces(),
         environment: args.quality.environment.as_deref().map(files::input).transpose()?,
         workers: args.server.job_workers(),
     };
+    if args.gbuffer.is_none() {
+        let seen = Seen {
+            scene: job.scene.clone(),
+            workers: job.workers,
+            settings: job.settings,
+        };
+        let mut progress = Progress::new();
+        let client = session::connect(&args.server, interrupt, &progress).await?;
+        let (gbuffer, _) = seen.gbuffer(&args.seen, &client, interrupt, &mut progress).await?;
+        gbuffer.write(&job.gbuffer)?;
+    }
     run(
         Work::Shade(job),
         &args.output,

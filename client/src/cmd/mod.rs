@@ -6,6 +6,7 @@ mod composite;
 mod daemon;
 mod failure;
 mod files;
+mod filter;
 mod frame;
 mod generate;
 mod interrupt;
@@ -16,6 +17,7 @@ mod render;
 mod scenes;
 mod session;
 mod summary;
+mod view;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use failure::Failure;
@@ -58,8 +60,12 @@ enum Command {
     Gbuffer(mesh::GbufferArgs),
     /// Build the octree of a scene from meshes or point clouds
     Build(jobs::BuildArgs),
-    /// Shade a G-buffer with a built scene
+    /// Shade a G-buffer, or what a camera sees, with a built scene
     Shade(jobs::ShadeArgs),
+    /// Show a built scene: its points in the light of the sky and of each other
+    View(view::ViewArgs),
+    /// Bake occlusion and irradiance onto the points of a cloud
+    Filter(filter::FilterArgs),
     /// Describe a built scene
     Info(daemon::InfoArgs),
     /// Show the daemon: memory, workers, open scenes
@@ -130,6 +136,8 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
         Command::Gbuffer(args) => mesh::gbuffer(args, interrupt).await,
         Command::Build(args) => jobs::build(args, interrupt).await,
         Command::Shade(args) => jobs::shade(args, interrupt).await,
+        Command::View(args) => view::view(args, interrupt).await,
+        Command::Filter(args) => filter::filter(args, interrupt).await,
         Command::Info(args) => daemon::info(args, interrupt).await,
         Command::Status(args) => daemon::status(args, interrupt).await,
         Command::Cache(args) => cache::cache(args, interrupt).await,
@@ -166,8 +174,8 @@ mod tests {
     fn every_command_of_the_contract_is_there() {
         let command = Arguments::command();
         for name in [
-            "demo", "render", "sample", "generate", "gbuffer", "build", "shade", "info", "status", "jobs", "watch",
-            "cancel", "pause", "resume", "retry", "shutdown",
+            "demo", "render", "sample", "generate", "gbuffer", "build", "shade", "view", "filter", "info", "status",
+            "jobs", "watch", "cancel", "pause", "resume", "retry", "shutdown",
         ] {
             assert!(command.find_subcommand(name).is_some(), "{name}");
         }
