@@ -10,6 +10,7 @@ mod client;
 mod convert;
 mod error;
 mod job;
+mod live;
 pub mod private;
 mod shape;
 pub mod size;
@@ -21,5 +22,6 @@ pub use job::{
     BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
     serialize_statistics,
 };
+pub use live::{LIVE_RECEIVERS_MAX, LiveJob};
 pub use pbgi_points::{CloudOptions, Density};
 pub use shape::{LevelShape, SceneShape};

@@ -142,6 +142,8 @@ pub struct TaskInfo {
     pub settings: ShadeSettings,
     /// Light from far away.
     pub environment: Option<Arc<Environment>>,
+    /// Angle between neighbouring rays, where the tiles are rays.
+    pub pixel_angle: Option<f32>,
 }
 
 impl Dispatcher {
@@ -527,6 +529,7 @@ impl Dispatcher {
                 mount: live.mounted.id(),
                 settings: live.settings,
                 environment: live.environment.clone(),
+                pixel_angle: live.pixel_angle,
             });
         }
         let record = state.jobs.get(&job);
@@ -536,6 +539,7 @@ impl Dispatcher {
                 mount: shading.mounted.id(),
                 settings: task.settings,
                 environment: shading.environment.clone(),
+                pixel_angle: None,
             }),
             _ => Err(JobError::new(JobErrorKind::NotFound, format!("task {} is over", job.0))),
         }

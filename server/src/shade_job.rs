@@ -11,7 +11,7 @@ use crate::roots::Place;
 use crate::scheduler::JobNo;
 use pbgi_cache::JobCounters;
 use pbgi_core::limits::IMAGE_PIXELS_MAX;
-use pbgi_core::{Environment, Statistics};
+use pbgi_core::{Environment, SceneInfo, Statistics};
 use pbgi_points::{GBuffer, PassThrough, PointsError};
 use pbgi_store::StoreError;
 use std::collections::HashSet;
@@ -307,7 +307,14 @@ pub async fn write(
 
 pub(crate) fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds: f64) -> Statistics {
     let info = shading.mounted.scene().info();
-    let tiles = &shading.counters;
+    Statistics {
+        holes: Some(shading.frame.holes() as f64),
+        ..tile_statistics(info, &shading.counters, pages, seconds)
+    }
+}
+
+/// What shading tiles of a scene took: every row that does not need to know what they were part of.
+pub(crate) fn tile_statistics(info: &SceneInfo, tiles: &Counters, pages: &JobCounters, seconds: f64) -> Statistics {
     let count = |value: u64| Some(value as f64);
     let ratio = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
     // Loads are counted here, not by workers: one that dies takes its tile's counters with it, but the page was read.
@@ -334,7 +341,6 @@ pub(crate) fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds
         shared_hits: count(tiles.shared_hits),
         shared_hits_other_job: count(tiles.shared_hits_other_job),
         cache_misses: count(misses),
-        holes: count(shading.frame.holes()),
         ..Statistics::default()
     }
 }

@@ -66,6 +66,7 @@ fn describe(info: &SceneInfo) -> String {
         ("points", grouped(info.point_count)),
         ("nodes", grouped(info.node_count)),
         ("bounds", bounds),
+        ("origin", info.origin.map(|axis| axis.to_string()).join(" ")),
         ("largest radius", info.radius_max.to_string()),
         ("node pages", pages(PageKind::Node)),
         ("point pages", pages(PageKind::Point)),
@@ -245,6 +246,7 @@ mod tests {
             bounds: None,
             quantizer: None,
             radius_max: 0.0,
+            origin: [0.0; 3],
             settings: BuildSettings::default(),
         };
         let text = describe(&info);

@@ -1,16 +1,18 @@
 //! `build`, `shade`, and what is done with jobs: `jobs`, `watch`, `cancel`.
 
 use super::args::{
-    CloudArgs, DensityArgs, FormArgs, JobArgs, OctreeArgs, OutputArgs, PassArgs, QualityArgs, RunningArgs, ServerArgs,
-    StatsArgs,
+    CloudArgs, DensityArgs, FormArgs, JobArgs, OctreeArgs, OutputArgs, PassArgs, QualityArgs, RunningArgs, SeenArgs,
+    ServerArgs, StatsArgs,
 };
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
 use super::look::{Look, LookArgs};
 use super::progress::Progress;
+use super::render::temporary_folder;
 use super::session::{self, Work};
 use super::summary;
+use super::view::Seen;
 use clap::Args;
 use pbgi_client::{BuildJob, Job, JobState, ShadeJob};
 use pbgi_points::LayeredImage;
@@ -73,8 +75,9 @@ const SHADE_EXAMPLES: &str = "\
 Examples:
   pbgi-client shade hall.pbgi --gbuffer passes.exr -o indirect.exr --environment sky.hdr
   pbgi-client shade hall.pbgi --gbuffer passes.exr --position Pcam --normal Ncam --space camera -o indirect.exr
+  pbgi-client shade town.pbgi --camera auto -o indirect.exr
 
-The G-buffer is an EXR file with P and N. The output has the layers indirect (irradiance), occlusion (0 open, 1 closed) and
+The G-buffer is an EXR file with P and N; without one, what a camera sees is found among the points. The output has the layers indirect (irradiance), occlusion (0 open, 1 closed) and
 bentnormal; the root R, G, B equal indirect. Cryptomatte layers and the header's attributes go into it as they are.";
 
 /// `shade`
@@ -86,13 +89,15 @@ pub(crate) struct ShadeArgs {
     scene: PathBuf,
     /// World-space positions and normals of the pixels, an EXR file
     #[arg(long, value_name = "G.exr")]
-    gbuffer: PathBuf,
+    gbuffer: Option<PathBuf>,
     #[command(flatten)]
     passes: PassArgs,
     #[command(flatten)]
     look: LookArgs,
     #[command(flatten)]
     output: OutputArgs,
+    #[command(flatten)]
+    seen: SeenArgs,
     #[command(flatten)]
     quality: QualityArgs,
     #[command(flatten)]
@@ -106,10 +111,28 @@ pub(crate) struct ShadeArgs {
 pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), Failure> {
     let existing = Existing::from_flag(args.output.overwrite);
     let look = args.look.check(existing)?;
+    let folder;
+    let gbuffer = match (&args.gbuffer, args.seen.is_given()) {
+        (Some(path), false) => files::input(path)?,
+        (None, true) if !args.job.detach => {
+            folder = temporary_folder()?;
+            folder.path().join("gbuffer.exr")
+        }
+        (None, true) => {
+            return Err(Failure::usage(
+                "--detach is for a G-buffer that is there: give --gbuffer",
+            ));
+        }
+        _ => {
+            return Err(Failure::usage(
+                "give either --gbuffer or a camera: --camera, --camera-file or --eye",
+            ));
+        }
+    };
     let job = ShadeJob {
         settings: args.quality.settings()?,
         scene: files::input(&args.scene)?,
-        gbuffer: files::input(&args.gbuffer)?,
+        gbuffer,
         passes: args.passes.options(),
         output: files::output_of_kind(&args.output.output, existing, "exr")?,
         overwrite: existing.replaces(),
@@ -121,6 +144,17 @@ pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), 
         return Err(Failure::usage(
             "--png and --preview need the finished picture here: leave out --detach, and let -o name a file of this machine",
         ));
+    }
+    if args.gbuffer.is_none() {
+        let seen = Seen {
+            scene: job.scene.clone(),
+            workers: job.workers,
+            settings: job.settings,
+        };
+        let mut progress = Progress::new();
+        let client = session::connect(&args.server, interrupt, &progress).await?;
+        let (gbuffer, _) = seen.gbuffer(&args.seen, &client, interrupt, &mut progress).await?;
+        gbuffer.write(&job.gbuffer)?;
     }
     run(
         Work::Shade(job),

@@ -7,6 +7,7 @@ mod daemon;
 mod diff;
 mod failure;
 mod files;
+mod filter;
 mod frame;
 mod generate;
 mod interrupt;
@@ -18,6 +19,7 @@ mod render;
 mod scenes;
 mod session;
 mod summary;
+mod view;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use failure::Failure;
@@ -61,8 +63,12 @@ enum Command {
     Gbuffer(mesh::GbufferArgs),
     /// Build the octree of a scene from meshes or point clouds
     Build(jobs::BuildArgs),
-    /// Shade a G-buffer with a built scene
+    /// Shade a G-buffer, or what a camera sees, with a built scene
     Shade(jobs::ShadeArgs),
+    /// Show a built scene: its points in the light of the sky and of each other
+    View(view::ViewArgs),
+    /// Bake occlusion and irradiance onto the points of a cloud
+    Filter(filter::FilterArgs),
     /// Compare two pictures layer by layer
     Diff(diff::DiffArgs),
     /// Describe a built scene
@@ -135,6 +141,8 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
         Command::Gbuffer(args) => mesh::gbuffer(args, interrupt).await,
         Command::Build(args) => jobs::build(args, interrupt).await,
         Command::Shade(args) => jobs::shade(args, interrupt).await,
+        Command::View(args) => view::view(args, interrupt).await,
+        Command::Filter(args) => filter::filter(args, interrupt).await,
         Command::Diff(args) => diff::diff(args, interrupt).await,
         Command::Info(args) => daemon::info(args, interrupt).await,
         Command::Status(args) => daemon::status(args, interrupt).await,
@@ -172,8 +180,8 @@ mod tests {
     fn every_command_of_the_contract_is_there() {
         let command = Arguments::command();
         for name in [
-            "demo", "render", "sample", "generate", "gbuffer", "build", "shade", "diff", "info", "status", "jobs",
-            "watch", "cancel", "pause", "resume", "retry", "shutdown",
+            "demo", "render", "sample", "generate", "gbuffer", "build", "shade", "view", "filter", "diff", "info",
+            "status", "jobs", "watch", "cancel", "pause", "resume", "retry", "shutdown",
         ] {
             assert!(command.find_subcommand(name).is_some(), "{name}");
         }

@@ -202,7 +202,7 @@ async fn scene(
 }
 
 /// One command, one record: bytes of both jobs, the higher peak, everything else from whichever job knows it.
-fn add(statistics: &mut Statistics, shading: &Statistics) {
+pub(crate) fn add(statistics: &mut Statistics, shading: &Statistics) {
     let build = statistics.clone();
     statistics.update(shading);
     let sum = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(|a, b| a + b);
@@ -219,7 +219,7 @@ fn write(plan: &Plan, gbuffer: &GBuffer, shaded: &Path, statistics: &Statistics)
     plan.look.show(image.data_window, &image.triple("").unwrap_or_default())
 }
 
-fn temporary_folder() -> Result<tempfile::TempDir, Failure> {
+pub(crate) fn temporary_folder() -> Result<tempfile::TempDir, Failure> {
     let folder = tempfile::Builder::new().prefix("pbgi-render-").tempdir();
     folder.map_err(|error| {
         Failure::failed(format!(

@@ -22,16 +22,17 @@ pub struct Camera {
 impl Camera {
     /// A camera at `eye` that looks at `target` with y up.
     pub fn look_at(eye: Vec3, target: Vec3, fov_y: f32) -> Self {
-        let up = if (target - eye).normalize_or_zero().y.abs() > 0.999 {
-            Vec3::Z
-        } else {
-            Vec3::Y
-        };
-        Self::looking(eye, target, up, fov_y)
+        Self::look_at_upright(eye, target, Vec3::Y, fov_y)
     }
 
-    /// The same, with another direction up that is not along the view.
-    pub(crate) fn looking(eye: Vec3, target: Vec3, up: Vec3, fov_y: f32) -> Self {
+    /// As [`Self::look_at`], with `up` up; with any direction up where the camera looks along it.
+    pub fn look_at_upright(eye: Vec3, target: Vec3, up: Vec3, fov_y: f32) -> Self {
+        let up = up.normalize_or(Vec3::Y);
+        let up = if (target - eye).normalize_or_zero().dot(up).abs() > 0.999 {
+            up.any_orthogonal_vector()
+        } else {
+            up
+        };
         Self {
             name: None,
             world_from_camera: Mat4::from_translation(eye) * rotation_to(target - eye, up),
@@ -51,13 +52,36 @@ impl Camera {
         Self::look_at(centre + from * distance, centre, FOV_Y)
     }
 
+    /// A camera that sees all of a scan in a picture of this width over height, closely: from the front and from above, the
+    /// more so the flatter the scan is.
+    pub fn overview(bounds: &Bounds, aspect: f32) -> Self {
+        const FOV_Y: f32 = 0.6;
+        const MARGIN: f32 = 1.03;
+        let (low, high) = (Vec3::from(bounds.min), Vec3::from(bounds.max));
+        let (centre, size) = ((low + high) / 2.0, high - low);
+        let flat = 1.0 - (size.y / size.x.max(size.z).max(f32::MIN_POSITIVE)).min(1.0);
+        let from = Vec3::new(0.45, 0.25 + 0.6 * flat, 0.9).normalize();
+        let camera = Self::look_at(centre + from, centre, FOV_Y);
+        let [right, up, back] = [0, 1, 2].map(|axis| camera.world_from_camera.col(axis).truncate());
+        let tangent = (FOV_Y / 2.0).tan();
+        // As far away as the corner asks that would leave the picture first.
+        let distance = (0..8).map(|corner| {
+            let side = |axis: usize| if corner >> axis & 1 == 1 { high[axis] } else { low[axis] };
+            let corner = Vec3::new(side(0), side(1), side(2)) - centre;
+            let across = (corner.dot(right).abs() / aspect).max(corner.dot(up).abs());
+            corner.dot(back) + across * MARGIN / tangent
+        });
+        let distance = distance.fold(f32::MIN_POSITIVE, f32::max);
+        Self::look_at(centre + from * distance, centre, FOV_Y)
+    }
+
     /// World position of the eye.
     pub fn eye(&self) -> Vec3 {
         self.world_from_camera.w_axis.truncate()
     }
 
     /// Unit direction of the ray through the centre of a pixel, world space; row 0 is at the top.
-    pub(crate) fn direction(&self, column: u32, row: u32, width: u32, height: u32) -> Vec3 {
+    pub fn direction(&self, column: u32, row: u32, width: u32, height: u32) -> Vec3 {
         let tangent = f64::from(self.fov_y / 2.0).tan();
         let (width, height) = (f64::from(width), f64::from(height));
         let x = (2.0 * (f64::from(column) + 0.5) - width) / height * tangent;
@@ -131,6 +155,26 @@ mod tests {
         }
         let behind = matrix * (camera.eye() * 2.0 - Vec3::new(-4.0, 0.0, 1.0)).extend(1.0);
         assert!(behind.w < 0.0, "what lies behind has no place");
+    }
+
+    #[test]
+    fn an_overview_holds_every_corner_and_wastes_little() {
+        for (max, aspect) in [([100.0, 3.0, 70.0], 1.5), ([1.0, 5.0, 1.0], 1.0), ([4.0; 3], 2.0)] {
+            let bounds = Bounds { min: [0.0; 3], max };
+            let camera = Camera::overview(&bounds, aspect);
+            let camera_from_world = camera.world_from_camera.inverse();
+            let tangent = (camera.fov_y / 2.0).tan();
+            let mut widest = 0f32;
+            for corner in 0..8 {
+                let side = |axis: usize| if corner >> axis & 1 == 1 { max[axis] } else { 0.0 };
+                let seen = camera_from_world.transform_point3(Vec3::new(side(0), side(1), side(2)));
+                assert!(seen.z < 0.0);
+                let place = (seen.x / aspect).abs().max(seen.y.abs()) / (-seen.z * tangent);
+                assert!(place <= 1.0, "{max:?} {place}");
+                widest = widest.max(place);
+            }
+            assert!(widest > 0.9, "{max:?} {widest}");
+        }
     }
 
     #[test]

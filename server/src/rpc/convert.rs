@@ -162,7 +162,7 @@ pub(super) fn job(status: JobStatus) -> v1::Job {
     }
 }
 
-fn statistics(statistics: &Statistics) -> v1::Statistics {
+pub(super) fn statistics(statistics: &Statistics) -> v1::Statistics {
     let rows = statistics.rows().into_iter();
     v1::Statistics {
         rows: rows.filter_map(|row| Some((row.name.to_owned(), row.value?))).collect(),
@@ -198,6 +198,7 @@ pub(super) fn scene(info: &SceneInfo) -> v1::SceneInfo {
             vec![x, y, z, quantizer.edge]
         }),
         radius_max: info.radius_max,
+        origin: info.origin.to_vec(),
         settings: Some(v1::BuildSettings {
             leaf_max: Some(info.settings.leaf_max),
             chunk_levels: Some(info.settings.chunk_levels),
@@ -228,6 +229,7 @@ pub(super) fn task(task: &TaskInfo) -> v1::Task {
         environment_width: task.environment.as_ref().map_or(0, |environment| environment.width()),
         environment_height: task.environment.as_ref().map_or(0, |environment| environment.height()),
         environment: pixels.flat_map(|value| value.to_le_bytes()).collect(),
+        rays: task.pixel_angle.map(|pixel_angle| v1::RayTracing { pixel_angle }),
     }
 }
 

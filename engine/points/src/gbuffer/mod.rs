@@ -1,10 +1,13 @@
-//! The G-buffer: what the camera sees in each pixel, rendered from a mesh or read from another renderer's passes.
+//! The G-buffer: what the camera sees in each pixel, rendered from a mesh, put together from what rays
+//! met in a scene, or read from another renderer's passes.
 
+mod hits;
 mod pass_through;
 mod read;
 mod render;
 mod space;
 
+pub use hits::{HitBuffer, RayHit};
 pub use pass_through::PassThrough;
 pub use read::GBufferOptions;
 pub use space::Space;

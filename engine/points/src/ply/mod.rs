@@ -7,11 +7,13 @@
 //! Files of ours name the exact box of their points in a comment (`pbgi-bounds`, six numbers), so that a build reads them
 //! once. They come in two forms: floats that any tool understands, and [`PlyForm::Records`], which a build takes as they are.
 
+mod copy;
 mod header;
 pub(crate) mod mesh;
 mod read;
 mod write;
 
+pub(crate) use copy::copy_ply;
 pub use read::PlyPoints;
 pub use write::{PlyForm, PlyWriter, write_point_ply};
 

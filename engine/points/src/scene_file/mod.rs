@@ -147,7 +147,7 @@ fn camera(view: &View) -> Result<Camera, String> {
     Ok(Camera {
         name: view.name.clone(),
         aspect_ratio: view.aspect,
-        ..Camera::looking(eye, target, up, view.fov.to_radians())
+        ..Camera::look_at_upright(eye, target, up, view.fov.to_radians())
     })
 }
 
