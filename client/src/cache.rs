@@ -1,9 +1,10 @@
 //! What the daemon's page cache holds, as plain types.
 
 use pbgi_proto::v1;
+use serde::Serialize;
 
 /// The page cache: what it holds, for whom, and how well it does.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct CacheStatus {
     /// Bytes of the shared segment.
     pub segment_bytes: u64,
@@ -24,7 +25,7 @@ pub struct CacheStatus {
 }
 
 /// Where pages were found.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Lookups {
     /// In a worker's own cache.
     pub local_hits: u64,
@@ -37,7 +38,7 @@ pub struct Lookups {
 }
 
 /// The frames of one kind of page, and what was done with them since the daemon started.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct CachePool {
     /// Frames.
     pub frames: u64,
@@ -68,7 +69,7 @@ pub struct CachePool {
 }
 
 /// An open scene.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct CachedScene {
     /// Its path.
     pub scene: String,
@@ -81,7 +82,7 @@ pub struct CachedScene {
 }
 
 /// One file of an open scene.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct CachedFile {
     /// Pages.
     pub pages: u64,
@@ -98,7 +99,7 @@ pub struct CachedFile {
 }
 
 /// What a worker holds.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct CachePins {
     /// Its seat.
     pub slot: u32,

@@ -21,18 +21,18 @@ use tonic::{Code, Request, Status};
 /// Until the daemon accepts a connection.
 const CONNECT_SECS: u64 = 5;
 /// Until an ordinary request is answered.
-const REQUEST_SECS: u64 = 30;
+pub(crate) const REQUEST_SECS: u64 = 30;
 /// Until a scene is opened and verified.
 const SCENE_SECS: u64 = 120;
 /// Until a daemon has finished what is leased.
 const SHUTDOWN_SECS: u64 = 60;
 /// A list of ten thousand jobs stays below this.
-const RESPONSE_BYTES_MAX: usize = 32 << 20;
+pub(crate) const RESPONSE_BYTES_MAX: usize = 32 << 20;
 
 /// A connection to one daemon. Cheap to clone; clones share the connection.
 #[derive(Clone, Debug)]
 pub struct Client {
-    channel: Channel,
+    pub(crate) channel: Channel,
     address: String,
     token: Option<MetadataValue<Ascii>>,
 }
@@ -130,7 +130,7 @@ impl Client {
         self.sign(wish.request(message))
     }
 
-    fn sign<T>(&self, mut request: Request<T>) -> Request<T> {
+    pub(crate) fn sign<T>(&self, mut request: Request<T>) -> Request<T> {
         if let Some(token) = &self.token {
             request.metadata_mut().insert("authorization", token.clone());
         }
@@ -358,13 +358,13 @@ impl Client {
 }
 
 /// What is wanted and how long it may take: the context of its errors.
-struct Wish {
-    action: String,
+pub(crate) struct Wish {
+    pub(crate) action: String,
     seconds: u64,
 }
 
 impl Wish {
-    fn new(action: impl Into<String>, seconds: u64) -> Self {
+    pub(crate) fn new(action: impl Into<String>, seconds: u64) -> Self {
         Self {
             action: action.into(),
             seconds,
@@ -382,7 +382,7 @@ impl Wish {
         convert::job(job).map_err(|fault| self.malformed(fault))
     }
 
-    fn malformed(&self, fault: String) -> ClientError {
+    pub(crate) fn malformed(&self, fault: String) -> ClientError {
         ClientError::Malformed {
             action: self.action.clone(),
             fault,
@@ -390,7 +390,7 @@ impl Wish {
     }
 
     /// The one place where gRPC codes become ours.
-    fn failed(&self, status: &Status) -> ClientError {
+    pub(crate) fn failed(&self, status: &Status) -> ClientError {
         let action = self.action.clone();
         let message = status.message().to_owned();
         // A connection that breaks in mid-request is reported as an unknown or internal error of the transport.

@@ -3,8 +3,9 @@
 use crate::job::{
     BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
 };
+use crate::live::LiveJob;
 use pbgi_core::{Bounds, BuildId, BuildSettings, NodeIndex, Quantizer, SceneInfo, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius};
+use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, Space};
 use pbgi_proto::v1;
 use std::path::Path;
 
@@ -39,6 +40,26 @@ pub(crate) fn shade_task(job: &ShadeJob) -> Result<v1::ShadeTask, String> {
         settings: Some(wire_shade_settings(&job.settings)),
         environment: job.environment.as_deref().map(text).transpose()?.unwrap_or_default(),
         workers: job.workers.unwrap_or(0),
+        position: job.passes.position.clone().unwrap_or_default(),
+        normal: job.passes.normal.clone().unwrap_or_default(),
+        space: match job.passes.space {
+            Space::Checked => v1::Space::Checked,
+            Space::World => v1::Space::World,
+            Space::Camera => v1::Space::Camera,
+        }
+        .into(),
+    })
+}
+
+pub(crate) fn live_start(job: &LiveJob) -> Result<v1::ShadePointsStart, String> {
+    Ok(v1::ShadePointsStart {
+        scene: text(&job.scene)?,
+        settings: Some(wire_shade_settings(&job.settings)),
+        environment: job.environment.as_deref().map(text).transpose()?.unwrap_or_default(),
+        priority: job.priority,
+        workers: job.workers.unwrap_or(0),
+        report: true,
+        rays: None,
     })
 }
 
@@ -136,7 +157,7 @@ pub(crate) fn job(wire: v1::Job) -> Result<Job, String> {
 }
 
 /// Rows of names that this version does not know are left out: a newer daemon may count more.
-fn statistics(wire: v1::Statistics) -> Statistics {
+pub(crate) fn statistics(wire: v1::Statistics) -> Statistics {
     let mut statistics = Statistics::default();
     for (name, value) in wire.rows {
         statistics.set(&name, value);
@@ -173,8 +194,17 @@ pub(crate) fn scene_info(wire: &v1::SceneInfo) -> Result<SceneInfo, String> {
         bounds,
         quantizer,
         radius_max: wire.radius_max,
+        origin: origin(&wire.origin)?,
         settings,
     })
+}
+
+fn origin(wire: &[f64]) -> Result<[f64; 3], String> {
+    match wire {
+        [] => Ok([0.0; 3]),
+        &[x, y, z] => Ok([x, y, z]),
+        _ => Err(format!("an origin of {} numbers", wire.len())),
+    }
 }
 
 fn bounds(wire: &v1::Bounds) -> Result<Bounds, String> {

@@ -1,7 +1,8 @@
 //! Jobs and daemon in plain types.
 
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Density};
+use pbgi_points::{CloudOptions, Density, GBufferOptions};
+use serde::{Serialize, Serializer};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -29,6 +30,8 @@ pub struct ShadeJob {
     pub scene: PathBuf,
     /// The G-buffer, absolute.
     pub gbuffer: PathBuf,
+    /// How it is read.
+    pub passes: GBufferOptions,
     /// The image, absolute.
     pub output: PathBuf,
     /// Whether an existing output is replaced.
@@ -42,7 +45,7 @@ pub struct ShadeJob {
 }
 
 /// What is wanted beside the task.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct JobOptions {
     /// For whom; empty for the calling user.
     pub user: String,
@@ -55,11 +58,12 @@ pub struct JobOptions {
     /// Whether it waits to be resumed.
     pub paused: bool,
     /// Whether an unfinished job with the same task, under whatever id, will do.
+    #[serde(skip)]
     pub attach: bool,
 }
 
 /// A line of a job's history.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct JobEvent {
     /// Milliseconds since the Unix epoch.
     pub unix_millis: i64,
@@ -68,7 +72,8 @@ pub struct JobEvent {
 }
 
 /// Where a job stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum JobState {
     /// Waits.
     Queued,
@@ -101,7 +106,7 @@ impl JobState {
 }
 
 /// A job as the daemon reports it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Job {
     /// The caller's name for it.
     pub id: String,
@@ -116,6 +121,7 @@ pub struct Job {
     /// Why it failed; empty otherwise.
     pub error: String,
     /// Complete when the job is.
+    #[serde(serialize_with = "serialize_statistics")]
     pub statistics: Statistics,
     /// What the job does, for people.
     pub title: String,
@@ -125,8 +131,27 @@ pub struct Job {
     pub history: Vec<JobEvent>,
 }
 
+/// Largest integer that a JSON number holds exactly.
+const EXACT_MAX: f64 = 9_007_199_254_740_992.0;
+
+/// Every row by name, in the table's order: counts without a fraction, `null` where a row does not apply.
+///
+/// # Errors
+/// Those of the serializer.
+pub fn serialize_statistics<S: Serializer>(statistics: &Statistics, serializer: S) -> Result<S::Ok, S::Error> {
+    let number = |value: Option<f64>| match value {
+        Some(value) if value.fract() == 0.0 && (0.0..=EXACT_MAX).contains(&value) => {
+            serde_json::Value::from(value as u64)
+        }
+        // What is not a number does not apply.
+        Some(value) => serde_json::Value::from(value),
+        None => serde_json::Value::Null,
+    };
+    serializer.collect_map(statistics.rows().iter().map(|row| (row.name, number(row.value))))
+}
+
 /// The daemon as it reports itself.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DaemonStatus {
     /// Version of the program.
     pub version: String,
@@ -151,7 +176,7 @@ pub struct DaemonStatus {
 }
 
 /// Frames of one kind.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Pool {
     /// All.
     pub frames: u32,
@@ -160,7 +185,7 @@ pub struct Pool {
 }
 
 /// A worker process.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct WorkerStatus {
     /// Its seat.
     pub slot: u32,
@@ -175,7 +200,7 @@ pub struct WorkerStatus {
 }
 
 /// An open scene.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct MountStatus {
     /// Its directory.
     pub scene: String,

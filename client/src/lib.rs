@@ -10,6 +10,7 @@ mod client;
 mod convert;
 mod error;
 mod job;
+mod live;
 pub mod private;
 mod shape;
 pub mod size;
@@ -17,6 +18,10 @@ pub mod size;
 pub use cache::{CachePins, CachePool, CacheStatus, CachedFile, CachedScene, Lookups};
 pub use client::Client;
 pub use error::{ClientError, Refusal};
-pub use job::{BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus};
+pub use job::{
+    BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
+    serialize_statistics,
+};
+pub use live::{LIVE_RECEIVERS_MAX, LiveJob};
 pub use pbgi_points::{CloudOptions, Density};
 pub use shape::{LevelShape, SceneShape};

@@ -1,9 +1,10 @@
 //! What a tree looks like, as the daemon tells it.
 
 use pbgi_proto::v1;
+use serde::Serialize;
 
 /// Counts over all nodes of a scene.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct SceneShape {
     /// One for each level from the root to the deepest node.
     pub levels: Vec<LevelShape>,
@@ -12,7 +13,7 @@ pub struct SceneShape {
 }
 
 /// The nodes of one level.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct LevelShape {
     /// Nodes with children.
     pub inner: u64,

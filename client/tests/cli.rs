@@ -199,3 +199,88 @@ fn a_statistics_file_that_cannot_be_written_is_found_out_first() {
     assert!(text.contains("no/s.json"), "{text}");
     assert_eq!(files(home.path()), ["t.bin", "t.gltf"]);
 }
+
+#[test]
+fn diff_tells_how_far_pictures_are_apart() {
+    let home = tempfile::tempdir().unwrap();
+    let write = |name: &str, value: f32| {
+        let mut image = pbgi_points::LayeredImage::new(8, 4);
+        let mut occlusion = vec![0.5; 32];
+        occlusion[11] = value;
+        image.add("occlusion.Z", pbgi_points::Precision::Float, occlusion);
+        image.add_rgb("", pbgi_points::Precision::Half, &[[1.0; 3]; 32]);
+        image.write_exr(&home.path().join(name)).unwrap();
+    };
+    write("a.exr", 0.75);
+    write("b.exr", 0.5);
+    let told = |line: &str, code: i32| {
+        let output = run(home.path(), line);
+        assert_eq!(output.status.code(), Some(code), "{line}: {output:?}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let text = told("diff a.exr b.exr", 0);
+    assert!(
+        text.contains("(root)") && text.contains("2.500e-1") && text.contains("3, 1"),
+        "{text}"
+    );
+    told("diff a.exr b.exr --threshold 0.05", 0);
+    told("diff a.exr b.exr --threshold 0.04 -o heat.png", 1);
+    assert!(
+        files(home.path()).contains(&"heat.png".to_owned()),
+        "written whatever the verdict"
+    );
+    told("diff a.exr b.exr --threshold 0.04 --layer other", 2);
+    let text = told("diff a.exr b.exr --layer occlusion --threshold 0.04 --json", 1);
+    let report: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(report["within_threshold"], false);
+    let layer = &report["layers"][0];
+    assert_eq!(
+        (&layer["layer"], &layer["maximum_at"]),
+        (&"occlusion".into(), &serde_json::json!([3, 1]))
+    );
+    assert!((layer["rms"].as_f64().unwrap() - 0.25 / 32f64.sqrt()).abs() < 1e-9);
+    for (line, word) in [
+        ("diff a.exr gone.exr", "gone.exr"),
+        ("diff a.exr b.exr -o heat.png", "--overwrite"),
+        ("diff a.exr b.exr -o heat.exr", ".png"),
+        ("diff a.exr b.exr --threshold -1", "--threshold"),
+    ] {
+        let text = fails(home.path(), 2, line);
+        assert!(text.contains(word), "{text}");
+    }
+}
+
+#[test]
+fn problems_of_a_scene_file_are_told_by_line() {
+    let home = tempfile::tempdir().unwrap();
+    triangle(home.path());
+    let scene = "[[mesh]]\nfile = \"t.gltf\"\nscale = 0\n\n[[light.point]]\nposition = [0, 0, 1]\nintensity = -5\n";
+    std::fs::write(home.path().join("s.toml"), scene).unwrap();
+    let text = fails(home.path(), 1, "gbuffer s.toml -o g.exr");
+    assert!(text.contains("s.toml:1: ") && text.contains("s.toml:5: "), "{text}");
+    std::fs::write(home.path().join("s.toml"), scene.replace("scale = 0", "skale = 1")).unwrap();
+    let text = fails(home.path(), 1, "sample s.toml -o p.ply");
+    assert!(text.contains("s.toml:3: ") && text.contains("skale"), "{text}");
+    std::fs::write(home.path().join("s.toml"), "[[mesh]]\nfile = \"t.gltf\"\n").unwrap();
+    assert!(run(home.path(), "gbuffer s.toml -o g.exr --size 8x8").status.success());
+    let names = files(home.path());
+    assert!(
+        names.contains(&"g.exr".to_owned()) && !names.contains(&"p.ply".to_owned()),
+        "{names:?}"
+    );
+}
+
+#[test]
+fn a_picture_to_look_at_is_one_of_this_machine() {
+    let home = tempfile::tempdir().unwrap();
+    for name in ["s.pbgi", "g.exr"] {
+        std::fs::write(home.path().join(name), "").unwrap();
+    }
+    let shade = "shade s.pbgi --gbuffer g.exr --png o.png -o";
+    for line in [format!("{shade} o.exr --detach"), format!("{shade} out:o.exr")] {
+        let text = fails(home.path(), 2, &line);
+        assert!(text.contains("--png and --preview"), "{text}");
+    }
+    let text = fails(home.path(), 2, "shade s.pbgi --gbuffer g.exr -o o.exr --space sideways");
+    assert!(text.contains("checked, world or camera"), "{text}");
+}

@@ -1,7 +1,7 @@
 //! Who may call, over what, and which files they may name: the part of the configuration that is about trust.
 
 use nix::unistd::{Gid, Uid};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -45,7 +45,7 @@ pub struct Tcp {
 /// How callers over TCP prove who they are.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Auth {
-    /// A certificate that the client authority signed; with a token file, its token as well.
+    /// A certificate that the client authority signed; where there are tokens, one of them as well.
     MutualTls {
         /// Our certificate chain, PEM.
         cert: PathBuf,
@@ -53,9 +53,58 @@ pub enum Auth {
         key: PathBuf,
         /// The authority of clients, PEM.
         client_ca: PathBuf,
-        /// A file with a token of at least 32 characters, readable by us alone.
-        token: Option<PathBuf>,
+        /// Tokens, and what they allow. Without any, a certificate allows everything.
+        tokens: Vec<Token>,
     },
     /// Not at all, on a loopback address.
     DangerouslyInsecure,
+}
+
+/// A secret that a caller shows besides its certificate.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Token {
+    /// A file with at least 32 characters, readable by us alone.
+    pub file: PathBuf,
+    /// What its bearer may do.
+    pub calls: BTreeSet<Call>,
+}
+
+/// The sorts of calls.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Call {
+    /// Looks at jobs, scenes, cache and daemon.
+    Look,
+    /// Submits and steers jobs, streams receivers, warms scenes.
+    Work,
+    /// Drops scenes and ends the daemon.
+    Operate,
+}
+
+impl Call {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Look, Self::Work, Self::Operate];
+
+    /// As the configuration names it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Look => "look",
+            Self::Work => "work",
+            Self::Operate => "operate",
+        }
+    }
+}
+
+impl Access {
+    /// Whether anybody but our own user may call.
+    pub fn others_may_call(&self) -> bool {
+        self.tcp.is_some() || !self.users.is_empty()
+    }
+
+    /// The tokens of callers over TCP.
+    pub(crate) fn tokens(&self) -> &[Token] {
+        match self.tcp.as_ref().map(|tcp| &tcp.auth) {
+            Some(Auth::MutualTls { tokens, .. }) => tokens,
+            _ => &[],
+        }
+    }
 }

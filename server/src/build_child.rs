@@ -1,7 +1,6 @@
 //! The build child: reads a spec on standard input, builds, and tells how it goes on standard output, a JSON object a line.
 
 use crate::confine::{Confine, confine};
-use crate::job::Density;
 use crate::limits;
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::resource::{Resource, setrlimit};
@@ -9,7 +8,7 @@ use nix::sys::signal::{SigSet, Signal};
 use pbgi_build::limits::MEMORY_MIN_BYTES;
 use pbgi_build::{BuildProgress, BuildReport, BuildRequest, build};
 use pbgi_core::{BuildSettings, Statistics};
-use pbgi_points::{CloudOptions, InputOptions};
+use pbgi_points::{CloudOptions, Density, InputOptions};
 use pbgi_store::Overwrite;
 use serde::{Deserialize, Serialize};
 use std::fs;
@@ -34,8 +33,8 @@ pub struct Spec {
     pub overwrite: bool,
     /// How.
     pub settings: BuildSettings,
-    /// For meshes.
-    pub density: Density,
+    /// How densely meshes are sampled; `None` for the sampler's default.
+    pub density: Option<Density>,
     /// For clouds.
     pub cloud: CloudOptions,
     /// Where runs go.
@@ -129,12 +128,7 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
     let cancelled = cancel_flag()?;
     let default = InputOptions::default();
     let options = InputOptions {
-        density: match spec.density {
-            Density::Default => default.density,
-            Density::Spacing(spacing) => pbgi_points::Density::Spacing(spacing),
-            Density::Points(points) => pbgi_points::Density::Points(points),
-            Density::View(view) => pbgi_points::Density::View(view),
-        },
+        density: spec.density.unwrap_or(default.density),
         cloud: spec.cloud,
         // What the build itself cannot do without comes first.
         memory_bytes: spec.memory_bytes.saturating_sub(MEMORY_MIN_BYTES),

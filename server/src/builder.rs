@@ -65,7 +65,7 @@ pub async fn run(
 
 /// What the child must know; its paths are real ones, and it is kept to their roots.
 fn spec(dispatcher: &Dispatcher, task: &BuildTask) -> Result<Spec, JobError> {
-    let (memory, roots) = (&dispatcher.config.memory, &dispatcher.roots);
+    let (memory, roots) = (&dispatcher.config.memory, dispatcher.roots());
     let scratch_dir = dispatcher.config.options.scratch_dir.clone();
     let real = |path: &PathBuf| roots.real(path, Want::Read);
     let real_root = |path: &PathBuf| roots.root_of(path).map(|(root, _)| root);
@@ -96,12 +96,12 @@ fn spec(dispatcher: &Dispatcher, task: &BuildTask) -> Result<Spec, JobError> {
 
 /// Real paths of a task as the client knows them.
 fn hide(dispatcher: &Dispatcher, task: &BuildTask, text: String) -> String {
-    let mut text = text;
+    let (mut text, roots) = (text, dispatcher.roots());
     for (real, name) in task
         .inputs
         .iter()
         .chain([&task.output])
-        .filter_map(|path| dispatcher.roots.root_of(path))
+        .filter_map(|path| roots.root_of(path))
     {
         let real = format!("{}/", real.to_string_lossy().trim_end_matches('/'));
         text = text.replace(&real, &format!("{name}:"));

@@ -51,7 +51,7 @@ pub(crate) enum Command {
 
 #[derive(Clone, Debug, Args)]
 pub(crate) struct ServeArguments {
-    /// Options in a file (TOML); those on the command line win. SIGHUP reads it again for what is logged
+    /// Options in a file (TOML); those on the command line win. SIGHUP reads it again
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
     /// Serve one user without supervision: leave the session, log to STATE_DIR/server.log, exit when idle
@@ -171,6 +171,7 @@ impl ServeArguments {
                 .or(file.points_per_page.map(small))
                 .unwrap_or(POINTS_PER_PAGE_DEFAULT),
             access: file.access.clone(),
+            config_file: self.config.as_deref().map(absolute).transpose()?,
         })
     }
 }

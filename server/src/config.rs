@@ -1,7 +1,8 @@
 //! What the daemon runs with: one value, checked once.
 
-use crate::access::{Access, Auth};
+use crate::access::{Access, Auth, Token};
 use crate::budget::{Machine, MemoryPlan};
+use crate::config_file::NO_ROOTS;
 use crate::error::ServerError;
 use crate::limits;
 use pbgi_cache::{CacheBudget, SegmentLayout};
@@ -35,6 +36,8 @@ pub struct Options {
     pub points_per_page: u32,
     /// Who may call, and what they may name.
     pub access: Access,
+    /// The file that said so, if there is one.
+    pub config_file: Option<PathBuf>,
 }
 
 impl Options {
@@ -52,7 +55,98 @@ impl Options {
             nodes_per_page: NODES_PER_PAGE_DEFAULT,
             points_per_page: POINTS_PER_PAGE_DEFAULT,
             access: Access::default(),
+            config_file: None,
         }
+    }
+
+    /// Checks that clients can name none of our own files, whatever links lead there.
+    ///
+    /// # Errors
+    /// [`ServerError::Configuration`] with a line for each root that overlaps with one of them.
+    pub fn check_roots(&self) -> Result<(), ServerError> {
+        let mut own = vec![&self.runtime_dir, &self.state_dir, &self.scratch_dir];
+        own.extend(&self.config_file);
+        if let Some(Auth::MutualTls {
+            cert, key, client_ca, ..
+        }) = self.access.tcp.as_ref().map(|tcp| &tcp.auth)
+        {
+            own.extend([cert, key, client_ca]);
+        }
+        own.extend(self.access.tokens().iter().map(|token| &token.file));
+        let mut problems = Vec::new();
+        if self.access.roots.is_empty() && self.access.others_may_call() {
+            problems.push(NO_ROOTS.to_owned());
+        }
+        for (name, root) in &self.access.roots {
+            let path = real(&root.path);
+            let near = |own: &&&PathBuf| real(own).starts_with(&path) || path.starts_with(real(own));
+            problems.extend(own.iter().filter(near).map(|own| {
+                format!(
+                    "roots.{name}.path overlaps with the daemon's own {}, at {}",
+                    own.display(),
+                    root.path.display()
+                )
+            }));
+        }
+        if problems.is_empty() {
+            Ok(())
+        } else {
+            Err(ServerError::Configuration(problems))
+        }
+    }
+
+    /// Takes over from other options what can change while the daemon runs.
+    pub fn take_over(&mut self, new: &Self) -> Changes {
+        let (mut taken, mut left) = (Vec::new(), Vec::new());
+        let note = |changed: bool, notes: &mut Vec<&'static str>, key| notes.extend(changed.then_some(key));
+        note(self.idle != new.idle, &mut taken, "idle_seconds");
+        note(self.access.users != new.access.users, &mut taken, "allow_users");
+        note(self.access.roots != new.access.roots, &mut taken, "roots");
+        note(self.runtime_dir != new.runtime_dir, &mut left, "runtime_dir");
+        note(self.state_dir != new.state_dir, &mut left, "state_dir");
+        note(self.scratch_dir != new.scratch_dir, &mut left, "scratch_dir");
+        note(self.memory_bytes != new.memory_bytes, &mut left, "memory");
+        note(self.workers != new.workers, &mut left, "workers");
+        note(self.nodes_per_page != new.nodes_per_page, &mut left, "nodes_per_page");
+        note(
+            self.points_per_page != new.points_per_page,
+            &mut left,
+            "points_per_page",
+        );
+        note(self.access.group != new.access.group, &mut left, "group");
+        note(self.access.http != new.access.http, &mut left, "http");
+        self.idle = new.idle;
+        self.access.users.clone_from(&new.access.users);
+        self.access.roots.clone_from(&new.access.roots);
+        let (own, other) = (&mut self.access.tcp, &new.access.tcp);
+        if let (Some(own), Some(other)) = (own.as_mut(), other)
+            && let (Auth::MutualTls { tokens, .. }, Auth::MutualTls { tokens: others, .. }) =
+                (&mut own.auth, &other.auth)
+        {
+            tokens.clone_from(others);
+        }
+        note(own != other, &mut left, "tcp");
+        Changes { taken, left }
+    }
+}
+
+/// What another configuration changed, by key.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Changes {
+    /// What holds from now on.
+    pub taken: Vec<&'static str>,
+    /// What holds after a restart.
+    pub left: Vec<&'static str>,
+}
+
+/// Where a path leads, links followed as far as it is there.
+fn real(path: &Path) -> PathBuf {
+    let known = path
+        .ancestors()
+        .find_map(|known| Some((known, known.canonicalize().ok()?)));
+    match known {
+        Some((known, real)) => real.join(path.strip_prefix(known).unwrap_or(path)),
+        None => path.to_owned(),
     }
 }
 
@@ -87,6 +181,7 @@ impl Config {
                 });
             }
         }
+        options.check_roots()?;
         let memory = MemoryPlan::new(options.memory_bytes, workers, machine)?;
         let node_page = options.nodes_per_page as usize * size_of::<NodeRecord>();
         let point_page = options.points_per_page as usize * size_of::<PointRecord>();
@@ -144,7 +239,15 @@ impl Config {
                     tcp.address
                 ));
             }
-            Some(tcp) => lines.push(format!("TCP: {}, mutual TLS", tcp.address)),
+            Some(tcp) => {
+                let calls = |token: &Token| token.calls.iter().map(|call| call.name()).collect::<Vec<_>>().join("+");
+                let tokens: Vec<String> = access.tokens().iter().map(calls).collect();
+                let tokens = match tokens.as_slice() {
+                    [] => String::new(),
+                    tokens => format!(" and a token, which allows to {}", tokens.join(" or ")),
+                };
+                lines.push(format!("TCP: {}, mutual TLS{tokens}", tcp.address));
+            }
             None => lines.push("TCP: off".to_owned()),
         }
         lines.extend(
@@ -197,6 +300,7 @@ fn range(name: &'static str, value: u64, allowed: std::ops::RangeInclusive<u64>)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::access::{Call, Root, Tcp};
 
     const MACHINE: Machine = Machine {
         shared_free_bytes: 100 << 30,
@@ -235,6 +339,69 @@ mod tests {
         options.points_per_page = 131_072;
         let error = Config::new(options, &MACHINE).unwrap_err();
         assert_eq!(error.exit_code(), 78, "{error}");
+    }
+
+    #[test]
+    fn root_that_overlaps_with_our_own_files_is_refused_whatever_link_leads_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let shots = folder.path().join("shots");
+        std::fs::create_dir(&shots).unwrap();
+        std::os::unix::fs::symlink(folder.path(), folder.path().join("link")).unwrap();
+        let mut options = Options::below(&folder.path().join("own"), "worker".into(), "server".into());
+        let mut told = |root: &Path, change: fn(&mut Options, &Path)| {
+            let root = Root {
+                path: root.to_owned(),
+                read: true,
+                write: false,
+                overwrite: false,
+            };
+            options.access.roots.insert("a".into(), root);
+            change(&mut options, folder.path());
+            let checked = Config::new(options.clone(), &MACHINE);
+            checked.map_or_else(|error| error.to_string(), |_| String::new())
+        };
+        assert_eq!(told(&shots, |_, _| {}), "");
+        // Above all three of our folders, below one, by a link; the state is in none of the keys of a file.
+        assert_eq!(told(folder.path(), |_, _| {}).lines().count(), 3);
+        assert!(told(&folder.path().join("own/state/deep"), |_, _| {}).contains("overlaps"));
+        assert!(told(&folder.path().join("link/own/scratch"), |_, _| {}).contains("scratch"));
+        let config = told(&shots, |options, folder| {
+            options.config_file = Some(folder.join("link/shots/server.toml"));
+        });
+        assert!(config.contains("server.toml"), "{config}");
+    }
+
+    #[test]
+    fn what_can_change_while_running_is_taken_over_and_the_rest_is_named() {
+        let tls = |file: &str, address: &str| Tcp {
+            address: address.parse().unwrap(),
+            auth: Auth::MutualTls {
+                cert: "/c".into(),
+                key: "/k".into(),
+                client_ca: "/a".into(),
+                tokens: vec![Token {
+                    file: file.into(),
+                    calls: [Call::Look].into(),
+                }],
+            },
+        };
+        let mut old = options();
+        old.access.tcp = Some(tls("/t", "127.0.0.1:1"));
+        let mut new = old.clone();
+        assert_eq!(old.take_over(&new), Changes::default());
+        new.idle = Some(Duration::from_secs(1));
+        new.access.tcp = Some(tls("/u", "127.0.0.1:1"));
+        let changes = old.take_over(&new);
+        assert_eq!(
+            (changes.taken.as_slice(), changes.left.len()),
+            (&["idle_seconds"][..], 0)
+        );
+        assert_eq!(old, new);
+        (new.workers, new.memory_bytes) = (7, None);
+        new.access.tcp = Some(tls("/u", "127.0.0.1:2"));
+        let changes = old.take_over(&new);
+        assert_eq!(changes.left, ["memory", "workers", "tcp"]);
+        assert_eq!(old.workers, 1);
     }
 
     #[test]

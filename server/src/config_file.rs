@@ -1,8 +1,9 @@
 //! The configuration file: TOML with strict keys, and every problem in it on a line of its own.
 
-use crate::access::{Access, Auth, Root, Tcp};
+use crate::access::{Access, Auth, Call, Root, Tcp, Token};
 use crate::budget::parse_bytes;
 use nix::unistd::{Gid, Group, Uid, User};
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
@@ -114,22 +115,14 @@ impl ConfigFile {
     }
 
     fn check_together(&self, problems: &mut Vec<String>) {
-        let access = &self.access;
-        if access.roots.is_empty() && (access.tcp.is_some() || !access.users.is_empty()) {
-            problems.push("others may call, so [roots.NAME] must say which files they may name".to_owned());
-        }
-        let own = [&self.runtime_dir, &self.state_dir, &self.scratch_dir];
-        for (name, root) in &access.roots {
-            let near = |own: &&PathBuf| own.starts_with(&root.path) || root.path.starts_with(own);
-            if let Some(own) = own.into_iter().flatten().find(near) {
-                problems.push(format!(
-                    "roots.{name}.path overlaps with the daemon's own {}",
-                    own.display()
-                ));
-            }
+        if self.access.roots.is_empty() && self.access.others_may_call() {
+            problems.push(NO_ROOTS.to_owned());
         }
     }
 }
+
+/// What is wrong where others may call and there are no roots.
+pub(crate) const NO_ROOTS: &str = "others may call, so [roots.NAME] must say which files they may name";
 
 fn read_tcp(table: Table, problems: &mut Vec<String>) -> Option<Tcp> {
     let mut section = Section::new("tcp.", table, problems);
@@ -141,7 +134,16 @@ fn read_tcp(table: Table, problems: &mut Vec<String>) -> Option<Tcp> {
             .contains(&auth)
             .then(|| auth.to_owned())
     });
+    let named = section.section("tokens");
     section.end();
+    let mut tokens: Vec<Token> = Vec::new();
+    tokens.extend(token.map(|file| Token {
+        file,
+        calls: Call::ALL.into(),
+    }));
+    for (name, value) in named.unwrap_or_default() {
+        tokens.extend(read_token(&name, value, problems));
+    }
     let Some(address) = address else {
         problems.push("tcp.address is missing".to_owned());
         return None;
@@ -164,11 +166,34 @@ fn read_tcp(table: Table, problems: &mut Vec<String>) -> Option<Tcp> {
                 cert,
                 key,
                 client_ca,
-                token,
+                tokens,
             },
         }),
         _ => {
             problems.push("tcp needs cert, key and client_ca: calls over TCP are by mutual TLS".to_owned());
+            None
+        }
+    }
+}
+
+fn read_token(name: &str, value: Value, problems: &mut Vec<String>) -> Option<Token> {
+    let Value::Table(table) = value else {
+        problems.push(format!("tcp.tokens.{name} must be a section: [tcp.tokens.{name}]"));
+        return None;
+    };
+    let prefix = format!("tcp.tokens.{name}.");
+    let mut section = Section::new(&prefix, table, problems);
+    let file = section.path("file");
+    let calls = section.read("calls", "a list out of \"look\", \"work\", \"operate\"", |value| {
+        let call = |word: &Value| Call::ALL.into_iter().find(|call| Some(call.name()) == word.as_str());
+        let calls = value.as_array()?.iter().map(call).collect::<Option<BTreeSet<Call>>>()?;
+        (!calls.is_empty()).then_some(calls)
+    });
+    section.end();
+    match (file, calls) {
+        (Some(file), Some(calls)) => Some(Token { file, calls }),
+        _ => {
+            problems.push(format!("tcp.tokens.{name} needs file and calls"));
             None
         }
     }
@@ -323,6 +348,9 @@ mod tests {
             key = "/k"
             client_ca = "/a"
             token_file = "/t"
+            [tcp.tokens.dashboard]
+            file = "/d"
+            calls = ["look"]
             [http]
             address = "127.0.0.1:9464"
         "#;
@@ -330,10 +358,12 @@ mod tests {
         assert_eq!(config.memory, Some(8 << 30));
         assert_eq!(config.access.users, [Uid::from_raw(0), Uid::from_raw(1000)]);
         assert!(config.access.roots["out"].overwrite && !config.access.roots["shots"].write);
-        assert!(matches!(
-            &config.access.tcp.unwrap().auth,
-            Auth::MutualTls { token: Some(_), .. }
-        ));
+        let tokens = config.access.tokens();
+        assert_eq!((tokens[0].file.as_path(), tokens[0].calls.len()), (Path::new("/t"), 3));
+        assert_eq!(
+            (tokens[1].file.as_path(), &tokens[1].calls),
+            (Path::new("/d"), &[Call::Look].into())
+        );
         assert_eq!(ConfigFile::parse("").unwrap(), ConfigFile::default());
     }
 
@@ -378,10 +408,14 @@ mod tests {
     }
 
     #[test]
-    fn others_may_call_only_where_roots_are_set_apart_from_our_own_folders() {
+    fn others_may_call_only_where_roots_say_what_they_may_name() {
         let tcp = "[tcp]\naddress = \"127.0.0.1:1\"\nauth = \"DANGEROUSLY_INSECURE\"";
         assert!(ConfigFile::parse(tcp).unwrap_err()[0].contains("[roots.NAME]"));
-        let inside = "state_dir = \"/mnt/a/state\"\n[roots.a]\npath = \"/mnt/a\"\nread = true";
-        assert!(ConfigFile::parse(inside).unwrap_err()[0].contains("overlaps"));
+        let token = "[tcp]\naddress = \"127.0.0.1:1\"\n[tcp.tokens.a]\nfile = \"/t\"\ncalls = [\"lok\"]";
+        let problems = ConfigFile::parse(token).unwrap_err().join("\n");
+        assert!(
+            problems.contains("tcp.tokens.a.calls is [\"lok\"], must be a list out of"),
+            "{problems}"
+        );
     }
 }

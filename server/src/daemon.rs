@@ -1,6 +1,6 @@
-//! The daemon from its first breath to its last: takes its sockets and its end of life as arguments.
+//! The daemon from its first breath to its last: takes its sockets, its orders and its end of life as arguments.
 
-use crate::config::Config;
+use crate::config::{Changes, Config, Options};
 use crate::dispatcher::Dispatcher;
 use crate::error::ServerError;
 use crate::http;
@@ -145,6 +145,15 @@ pub enum Life {
     Stopping,
 }
 
+/// What the daemon is told while it runs.
+#[derive(Clone, Debug)]
+pub struct Orders {
+    /// How far it is to stop.
+    pub stop: watch::Receiver<Stop>,
+    /// Options that were read again: what can change takes them over.
+    pub reload: watch::Receiver<Option<Options>>,
+}
+
 /// Runs until told to stop, idle for too long, or broken. `tell` is called at every turn of [`Life`].
 ///
 /// # Errors
@@ -154,10 +163,10 @@ pub async fn run(
     state: StateDir,
     listeners: Listeners,
     tell: impl Fn(Life),
-    mut stop: watch::Receiver<Stop>,
+    mut orders: Orders,
 ) -> Result<(), ServerError> {
     let paths = listeners.made.clone();
-    let outcome = run_daemon(&config, &state, listeners, tell, &mut stop).await;
+    let outcome = run_daemon(&config, &state, listeners, tell, &mut orders).await;
     for path in paths {
         // A stale socket is removed by the next start as well.
         let _ = fs::remove_file(path);
@@ -170,7 +179,7 @@ async fn run_daemon(
     state: &StateDir,
     listeners: Listeners,
     tell: impl Fn(Life),
-    stop: &mut watch::Receiver<Stop>,
+    orders: &mut Orders,
 ) -> Result<(), ServerError> {
     sweep(config, state)?;
     let remote = config
@@ -188,8 +197,19 @@ async fn run_daemon(
     let (dispatcher, supervisor) = start(config, cache, Arc::new(table)).inspect_err(|_| unlink(&name, state))?;
     dispatcher.restore(rows, rpc::stored_request);
     let (ending, ended) = watch::channel(false);
+    let users = rpc::Gate::users(&config.options.access);
+    let mut changing = Changing {
+        options: config.options.clone(),
+        users: users.clone(),
+        remote: remote.as_ref().map(rpc::Remote::gate),
+    };
     let mut servers = vec![
-        tokio::spawn(rpc::serve_jobs(listeners.jobs, dispatcher.clone(), ended.clone())),
+        tokio::spawn(rpc::serve_jobs(
+            listeners.jobs,
+            users,
+            dispatcher.clone(),
+            ended.clone(),
+        )),
         tokio::spawn(rpc::serve_queue(listeners.queue, dispatcher.clone(), ended.clone())),
     ];
     servers.push(tokio::spawn(http::serve_unix(
@@ -224,17 +244,22 @@ async fn run_daemon(
         tracing::info!("{line}");
     }
     tell(Life::Ready);
-    serve(config, &dispatcher, &tell, stop).await;
+    serve(&mut changing, &dispatcher, &tell, orders).await;
     tell(Life::Stopping);
     tracing::info!("stopping");
-    drain(&dispatcher, stop).await;
+    drain(&dispatcher, &orders.stop).await;
     ending.send_replace(true);
     let reaped = tokio::task::spawn_blocking(move || supervisor.stop()).await;
     if let Err(error) = reaped {
         tracing::error!(%error, "stopping the children panicked");
     }
+    let patience = match *orders.stop.borrow() {
+        Stop::Now => limits::DISCONNECT_NOW_MAX,
+        _ => limits::DISCONNECT_MAX,
+    };
+    let deadline = tokio::time::Instant::now() + patience;
     for server in servers {
-        disconnect(server).await;
+        disconnect(server, deadline).await;
     }
     // Others may still hold the segment's owner for a moment: its name goes now.
     unlink(&name, state);
@@ -281,6 +306,7 @@ fn start(
         worker_binary: options.worker_binary.clone(),
         queue_socket: options.queue_socket(),
         server_binary: options.server_binary.clone(),
+        spawn: std::process::Command::spawn,
     };
     let roots = Roots::open(&options.access.roots)?;
     let mut made = None;
@@ -313,7 +339,7 @@ fn start(
     }
 }
 
-async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, tell: &impl Fn(Life), stop: &mut watch::Receiver<Stop>) {
+async fn serve(changing: &mut Changing, dispatcher: &Arc<Dispatcher>, tell: &impl Fn(Life), orders: &mut Orders) {
     /// Ticks between two looks at the segment's name.
     const SEGMENT_TICKS: u32 = 5;
     let mut requested = dispatcher.stop_requested();
@@ -323,8 +349,12 @@ async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, tell: &impl Fn(Lif
     loop {
         tokio::select! {
             _ = clock.tick() => {}
-            _ = stop.wait_for(|stop| *stop >= Stop::Drain) => return,
+            _ = orders.stop.wait_for(|stop| *stop >= Stop::Drain) => return,
             _ = requested.wait_for(|stop| *stop) => return,
+            Ok(()) = orders.reload.changed() => {
+                let options = orders.reload.borrow_and_update().clone();
+                options.into_iter().for_each(|options| changing.reload(&options, dispatcher));
+            }
         }
         dispatcher.tick();
         tell(Life::Alive);
@@ -332,7 +362,7 @@ async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, tell: &impl Fn(Lif
         if ticks.is_multiple_of(SEGMENT_TICKS) {
             dispatcher.check_segment();
         }
-        if let (Some(limit), Some(idle)) = (config.options.idle, dispatcher.idle_time())
+        if let (Some(limit), Some(idle)) = (changing.options.idle, dispatcher.idle_time())
             && idle >= limit
         {
             tracing::info!(seconds = idle.as_secs(), "idle for long enough");
@@ -341,8 +371,54 @@ async fn serve(config: &Config, dispatcher: &Arc<Dispatcher>, tell: &impl Fn(Lif
     }
 }
 
+/// What may change while the daemon runs, and who must hear of it.
+struct Changing {
+    options: Options,
+    users: rpc::Gate,
+    remote: Option<rpc::Gate>,
+}
+
+impl Changing {
+    /// Takes over what can change, or nothing if there is something wrong with it.
+    fn reload(&mut self, new: &Options, dispatcher: &Dispatcher) {
+        match self.try_reload(new, dispatcher) {
+            Ok(Changes { taken, left }) => {
+                let list = |keys: &[&str]| match keys {
+                    [] => "nothing".to_owned(),
+                    keys => keys.join(", "),
+                };
+                tracing::info!(
+                    "the configuration was read again: {} changed, {} changes at the next start",
+                    list(&taken),
+                    list(&left)
+                );
+            }
+            Err(error) => tracing::error!(%error, "the configuration stays as it was"),
+        }
+    }
+
+    fn try_reload(&mut self, new: &Options, dispatcher: &Dispatcher) -> Result<Changes, ServerError> {
+        let mut options = self.options.clone();
+        let mut changes = options.take_over(new);
+        options.check_roots()?;
+        let roots = Roots::open(&options.access.roots)?;
+        // A secret may change while the names of its files do not.
+        let remote = match (&self.remote, &options.access.tcp) {
+            (Some(gate), Some(tcp)) => Some((gate, rpc::Gate::remote(&tcp.auth)?)),
+            _ => None,
+        };
+        if remote.is_some_and(|(gate, new)| gate.change(&new)) {
+            changes.taken.push("tokens");
+        }
+        self.users.change(&rpc::Gate::users(&options.access));
+        dispatcher.change_roots(roots);
+        self.options = options;
+        Ok(changes)
+    }
+}
+
 /// Lets leased tiles end, but not for ever.
-async fn drain(dispatcher: &Arc<Dispatcher>, stop: &mut watch::Receiver<Stop>) {
+async fn drain(dispatcher: &Arc<Dispatcher>, stop: &watch::Receiver<Stop>) {
     dispatcher.drain();
     let deadline = Instant::now() + limits::DRAIN_MAX;
     let mut clock = tokio::time::interval(limits::TICK / 4);
@@ -352,8 +428,8 @@ async fn drain(dispatcher: &Arc<Dispatcher>, stop: &mut watch::Receiver<Stop>) {
     }
 }
 
-async fn disconnect(mut server: JoinHandle<Result<(), ServerError>>) {
-    match tokio::time::timeout(limits::DISCONNECT_MAX, &mut server).await {
+async fn disconnect(mut server: JoinHandle<Result<(), ServerError>>, deadline: tokio::time::Instant) {
+    match tokio::time::timeout_at(deadline, &mut server).await {
         Ok(Ok(Ok(()))) => {}
         Ok(Ok(Err(error))) => tracing::error!(%error, "server failed"),
         Ok(Err(error)) => tracing::error!(%error, "server panicked"),

@@ -10,7 +10,7 @@ mod live;
 mod upkeep;
 
 pub use clients::{CacheReport, DaemonStatus, Submission};
-pub use figures::{JobFigures, Totals};
+pub use figures::{JobFigures, SceneFigures, Totals};
 
 use crate::config::Config;
 use crate::error::{JobError, JobErrorKind};
@@ -28,7 +28,7 @@ use pbgi_cache::CacheOwner;
 use pbgi_core::{Environment, MountId, SceneInfo, ShadeSettings};
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use std::time::Instant;
 use tokio::sync::{Notify, Semaphore, watch};
 use tracing::{Instrument, Span};
@@ -40,7 +40,7 @@ pub struct Dispatcher {
     pub(crate) mounts: Arc<Mounts>,
     pub(crate) supervisor: Handle,
     pub(crate) table: Arc<JobTable>,
-    pub(crate) roots: Roots,
+    roots: RwLock<Arc<Roots>>,
     /// Mebibytes of the work share that are free.
     pub(crate) work_memory: Arc<Semaphore>,
     /// One picture is read at a time: how large it is shows only then.
@@ -68,6 +68,8 @@ struct State {
     build_pids: HashMap<JobNo, u32>,
     number_last: u64,
     totals: Totals,
+    /// What the tiles of each scene took, since it was mounted.
+    scenes: HashMap<MountId, Counters>,
     draining: bool,
     parked: usize,
     active: Instant,
@@ -140,6 +142,8 @@ pub struct TaskInfo {
     pub settings: ShadeSettings,
     /// Light from far away.
     pub environment: Option<Arc<Environment>>,
+    /// Angle between neighbouring rays, where the tiles are rays.
+    pub pixel_angle: Option<f32>,
 }
 
 impl Dispatcher {
@@ -165,6 +169,7 @@ impl Dispatcher {
             build_pids: HashMap::new(),
             number_last: 0,
             totals: Totals::default(),
+            scenes: HashMap::new(),
             draining: false,
             parked: 0,
             active: Instant::now(),
@@ -177,13 +182,23 @@ impl Dispatcher {
             mounts,
             supervisor,
             table,
-            roots,
+            roots: RwLock::new(Arc::new(roots)),
             runtime,
             wake: Notify::new(),
             stop: watch::Sender::new(false),
             healthy: watch::Sender::new(true),
             state: Mutex::new(state),
         }
+    }
+
+    /// Which files clients may name now.
+    pub(crate) fn roots(&self) -> Arc<Roots> {
+        self.roots.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Changes which files clients may name. Files that running jobs have open stay open.
+    pub(crate) fn change_roots(&self, roots: Roots) {
+        *self.roots.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(roots);
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -514,6 +529,7 @@ impl Dispatcher {
                 mount: live.mounted.id(),
                 settings: live.settings,
                 environment: live.environment.clone(),
+                pixel_angle: live.pixel_angle,
             });
         }
         let record = state.jobs.get(&job);
@@ -523,6 +539,7 @@ impl Dispatcher {
                 mount: shading.mounted.id(),
                 settings: task.settings,
                 environment: shading.environment.clone(),
+                pixel_angle: None,
             }),
             _ => Err(JobError::new(JobErrorKind::NotFound, format!("task {} is over", job.0))),
         }

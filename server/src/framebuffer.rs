@@ -4,7 +4,6 @@
 //! Tiles and groups lie on a grid anchored at the display window, so that a crop or an overscan does not move them. A tile's
 //! values take the place of its positions and normals, which nobody needs any more: a pixel is 32 bytes all along.
 
-use glam::Mat4;
 use pbgi_core::limits::{GROUP_EDGE, TILE_EDGE};
 use pbgi_points::{GBuffer, Window};
 use std::collections::HashSet;
@@ -19,7 +18,6 @@ const VALUE_FLOATS: usize = 7;
 pub struct Framebuffer {
     data: Window,
     display: Window,
-    world_to_camera: Option<Mat4>,
     /// First column and row of tiles, and how many columns, on the grid of the display window.
     tile_origin: [i64; 2],
     tile_columns: u32,
@@ -63,8 +61,6 @@ pub struct Planes {
     pub data: Window,
     /// The picture they are part of.
     pub display: Window,
-    /// The camera, if the G-buffer has one.
-    pub world_to_camera: Option<Mat4>,
     /// W/m2.
     pub irradiance: Vec<[f32; 3]>,
     /// 0 open, 1 closed.
@@ -84,7 +80,6 @@ impl Framebuffer {
         let GBuffer {
             data_window: data,
             display_window: display,
-            world_to_camera,
             mut position,
             mut normal,
             mut coverage,
@@ -102,7 +97,6 @@ impl Framebuffer {
         Self {
             data,
             display,
-            world_to_camera,
             tile_origin,
             tile_columns: (last_column - tile_origin[0] + 1).max(0) as u32,
             occlusion: vec![0.0; position.len()],
@@ -230,7 +224,6 @@ impl Framebuffer {
         Planes {
             data: self.data,
             display: self.display,
-            world_to_camera: self.world_to_camera,
             irradiance: self.first,
             occlusion: self.occlusion,
             bent_normal: self.second,
@@ -327,6 +320,7 @@ mod tests {
             data_window: data,
             display_window: display,
             world_to_camera: None,
+            world_to_ndc: None,
             normal: vec![[0.0, 1.0, 0.0]; position.len()],
             coverage: vec![1.0; position.len()],
             position,

@@ -5,24 +5,11 @@ use crate::limits;
 use crate::roots::{Roots, Want};
 use crate::scheduler::{JobNo, Kind};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, ViewDensity};
+use pbgi_points::{CloudOptions, Density, GBufferOptions};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
-
-/// How densely meshes are sampled.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Density {
-    /// The default of the sampler.
-    Default,
-    /// Distance between points, world units.
-    Spacing(f32),
-    /// Number of points.
-    Points(u64),
-    /// As a camera sees them.
-    View(ViewDensity),
-}
 
 /// Points or meshes in, a scene out.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,8 +22,8 @@ pub struct BuildTask {
     pub overwrite: bool,
     /// How.
     pub settings: BuildSettings,
-    /// For meshes.
-    pub density: Density,
+    /// How densely meshes are sampled; `None` for the sampler's default.
+    pub density: Option<Density>,
     /// For clouds.
     pub cloud: CloudOptions,
 }
@@ -48,6 +35,8 @@ pub struct ShadeTask {
     pub scene: PathBuf,
     /// The G-buffer, absolute.
     pub gbuffer: PathBuf,
+    /// How it is read.
+    pub passes: GBufferOptions,
     /// The picture, absolute.
     pub output: PathBuf,
     /// Whether a picture that is there is replaced.
@@ -87,10 +76,10 @@ impl Request {
                     )));
                 }
                 match task.density {
-                    Density::Spacing(spacing) if !(spacing > 0.0 && spacing.is_finite()) => {
+                    Some(Density::Spacing(spacing)) if !(spacing > 0.0 && spacing.is_finite()) => {
                         return Err(JobError::invalid(format!("spacing is {spacing}, must be above 0")));
                     }
-                    Density::Points(0) => return Err(JobError::invalid("points is 0, must be above 0")),
+                    Some(Density::Points(0)) => return Err(JobError::invalid("points is 0, must be above 0")),
                     _ => {}
                 }
                 task.inputs
@@ -309,7 +298,7 @@ mod tests {
             output: "/out.pbgi".into(),
             overwrite: false,
             settings: BuildSettings::default(),
-            density: Density::Default,
+            density: None,
             cloud: CloudOptions::default(),
         };
         Request::Build(good.clone()).validate(&Roots::default()).unwrap();
@@ -318,8 +307,8 @@ mod tests {
             (|task| task.inputs.clear(), "0 inputs"),
             (|task| task.inputs = vec!["in.ply".into()], "input path is not absolute"),
             (|task| task.output = "/".into(), "output path names no file"),
-            (|task| task.density = Density::Spacing(f32::NAN), "spacing is NaN"),
-            (|task| task.density = Density::Points(0), "points is 0"),
+            (|task| task.density = Some(Density::Spacing(f32::NAN)), "spacing is NaN"),
+            (|task| task.density = Some(Density::Points(0)), "points is 0"),
             (|task| task.settings.leaf_max = 0, "leaf-max is 0"),
         ];
         for (change, text) in cases {

@@ -37,5 +37,5 @@ pub mod table;
 pub mod telemetry;
 
 pub use config::{Config, Options};
-pub use daemon::{Life, Listeners, Stop, run};
+pub use daemon::{Life, Listeners, Orders, Stop, run};
 pub use error::ServerError;

@@ -85,6 +85,8 @@ pub const TICK: Duration = Duration::from_millis(200);
 pub const DRAIN_MAX: Duration = Duration::from_secs(30);
 /// How long connections may take to end when the daemon stops.
 pub const DISCONNECT_MAX: Duration = Duration::from_secs(2);
+/// The same when it was told twice to stop.
+pub const DISCONNECT_NOW_MAX: Duration = Duration::from_millis(200);
 
 /// Smallest and longest pause before a worker that died before it was ready is started again.
 pub const BACKOFF: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(5)];
@@ -124,6 +126,8 @@ pub const SEGMENT_SHARE: f64 = 0.5;
 pub const BUILD_BYTES_MIN: u64 = 72 << 20;
 /// Bytes that one pixel of a picture takes at its peak, which is when it is written (113 measured at 1920 x 1080).
 pub const PICTURE_BYTES_PER_PIXEL: u64 = 116;
+/// Bytes of a pixel in a channel that goes from the G-buffer to the picture as it is.
+pub const PASSED_BYTES_PER_PIXEL: u64 = 4;
 /// Share of a machine's limit that is taken without being asked to, and the most of a container's limit.
 pub const LIMIT_SHARE: f64 = 0.8;
 

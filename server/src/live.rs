@@ -11,12 +11,15 @@ use pbgi_core::{Environment, ShadeSettings};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Instant;
 use tokio::sync::mpsc;
 
 /// Bytes of a receiver: position and normal.
 pub const RECEIVER_BYTES: usize = 24;
 /// Bytes of its values.
 pub const VALUE_BYTES: usize = 28;
+/// Bytes of what a ray meets.
+pub const HIT_BYTES: usize = 40;
 /// Receivers of a tile.
 pub const TILE_RECEIVERS: usize = (TILE_EDGE * TILE_EDGE) as usize;
 /// Receivers of a group.
@@ -33,6 +36,10 @@ pub struct LiveTask {
     pub environment: Option<PathBuf>,
     /// For whom.
     pub user: String,
+    /// Higher ones go first.
+    pub priority: i32,
+    /// Angle between neighbouring rays, radians, where rays are traced instead.
+    pub pixel_angle: Option<f32>,
 }
 
 /// A tile's values, or why there will be no more.
@@ -46,10 +53,18 @@ pub struct Live {
     pub settings: ShadeSettings,
     /// Light from far away.
     pub environment: Option<Arc<Environment>>,
+    /// See [`LiveTask::pixel_angle`].
+    pub pixel_angle: Option<f32>,
     /// Tiles that are not done.
     pub tiles: BTreeMap<u32, TileReceivers>,
     /// What its tiles took so far.
     pub counters: Counters,
+    /// Receivers given so far, holes among them.
+    pub receivers: u64,
+    /// Since when.
+    pub started: Instant,
+    /// Most memory of all processes since then, and most of the cache.
+    pub peaks: (u64, u64),
     /// Where values go; it has room for every tile that may be out.
     pub results: mpsc::Sender<LiveResult>,
 }
@@ -64,8 +79,13 @@ impl Live {
             .tiles
             .get(&tile)
             .map_or(0, |tile| tile.bytes.len() / RECEIVER_BYTES);
-        if values.len() != receivers * VALUE_BYTES {
-            let expected = receivers * VALUE_BYTES;
+        let expected = receivers
+            * if self.pixel_angle.is_some() {
+                HIT_BYTES
+            } else {
+                VALUE_BYTES
+            };
+        if values.len() != expected {
             return Err(format!(
                 "{expected} bytes of values expected, {} received",
                 values.len()

@@ -9,7 +9,8 @@ use cli::{Arguments, LogFormat, ServeArguments};
 use pbgi_server::budget::Machine;
 use pbgi_server::config_file::ConfigFile;
 use pbgi_server::state::{StateDir, make_directories};
-use pbgi_server::{Config, Life, Listeners, ServerError, Stop, build_child};
+use pbgi_server::supervisor::abort_on_core_panic;
+use pbgi_server::{Config, Life, Listeners, Options, Orders, ServerError, Stop, build_child};
 use std::io::Write;
 use std::process::ExitCode;
 use tokio::signal::unix::{SignalKind, signal};
@@ -88,7 +89,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
         process::log_to(&config.options.log_file())?;
     }
     let log = init_tracing(arguments, &file)?;
-    process::abort_on_core_panic();
+    abort_on_core_panic();
     process::prefer_to_live();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(cli::RUNTIME_THREADS)
@@ -101,7 +102,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
     let outcome = runtime.block_on(async {
         let listeners = Listeners::bind(&config, activated)?;
         process::make_outputs_readable();
-        let stop = stop_on_signals(arguments.clone(), log)?;
+        let orders = obey_signals(arguments.clone(), log)?;
         let private = arguments.private;
         let tell = |life| {
             process::tell_service_manager(life);
@@ -112,7 +113,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
                 }
             }
         };
-        pbgi_server::run(config, state, listeners, tell, stop).await
+        pbgi_server::run(config, state, listeners, tell, orders).await
     });
     // Blocking tasks that still run belong to jobs that are given up.
     runtime.shutdown_background();
@@ -120,7 +121,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
 }
 
 /// The first signal drains, the second ends. SIGHUP reads the configuration file again if there is one.
-fn stop_on_signals(arguments: ServeArguments, log: LogHandle) -> Result<watch::Receiver<Stop>, ServerError> {
+fn obey_signals(arguments: ServeArguments, log: LogHandle) -> Result<Orders, ServerError> {
     let listen = |kind| {
         signal(kind).map_err(|error| ServerError::Setup {
             action: "listen for signals",
@@ -130,7 +131,8 @@ fn stop_on_signals(arguments: ServeArguments, log: LogHandle) -> Result<watch::R
     let mut terminate = listen(SignalKind::terminate())?;
     let mut interrupt = listen(SignalKind::interrupt())?;
     let mut hangup = listen(SignalKind::hangup())?;
-    let (sender, receiver) = watch::channel(Stop::Run);
+    let (sender, stop) = watch::channel(Stop::Run);
+    let (options, reload) = watch::channel(None);
     tokio::spawn(async move {
         for stop in [Stop::Drain, Stop::Now] {
             loop {
@@ -138,7 +140,10 @@ fn stop_on_signals(arguments: ServeArguments, log: LogHandle) -> Result<watch::R
                     _ = terminate.recv() => break,
                     _ = interrupt.recv() => break,
                     _ = hangup.recv() => match arguments.config {
-                        Some(_) => reload(&arguments, &log),
+                        Some(_) => match read_again(&arguments, &log) {
+                            Ok(new) => drop(options.send_replace(Some(new))),
+                            Err(error) => tracing::error!(%error, "the configuration stays as it was"),
+                        },
                         None => break,
                     },
                 }
@@ -147,7 +152,7 @@ fn stop_on_signals(arguments: ServeArguments, log: LogHandle) -> Result<watch::R
         }
         sender.closed().await;
     });
-    Ok(receiver)
+    Ok(Orders { stop, reload })
 }
 
 /// Changes what is logged.
@@ -172,17 +177,19 @@ fn init_tracing(arguments: &ServeArguments, file: &ConfigFile) -> Result<LogHand
     Ok(handle)
 }
 
-/// Takes over from the configuration file what can be changed while running.
-fn reload(arguments: &ServeArguments, log: &LogHandle) {
-    let reloaded = arguments.file().and_then(|file| {
-        let filter = log_filter(arguments.log(&file))?;
-        log.reload(filter).map_err(|error| ServerError::Setup {
-            action: "change what is logged",
-            reason: error.to_string(),
-        })
-    });
-    match reloaded {
-        Ok(()) => tracing::info!("the configuration was read again; all but the log filter needs a restart"),
-        Err(error) => tracing::error!(%error, "the configuration stays as it was"),
+/// Reads the configuration file again and takes over what is logged; the rest is the daemon's.
+fn read_again(arguments: &ServeArguments, log: &LogHandle) -> Result<Options, ServerError> {
+    let file = arguments.file()?;
+    let options = arguments.options(&file)?;
+    let filter = log_filter(arguments.log(&file))?;
+    let text = filter.to_string();
+    let changed = log.with_current(|current| current.to_string() != text).unwrap_or(true);
+    log.reload(filter).map_err(|error| ServerError::Setup {
+        action: "change what is logged",
+        reason: error.to_string(),
+    })?;
+    if changed {
+        tracing::info!("from now on {text} is logged");
     }
+    Ok(options)
 }

@@ -1,8 +1,10 @@
-//! Metrics for Prometheus, made from a look at the daemon at each scrape: the rows of the paper's Table 1 for each job and scene,
-//! and what the cache, the workers and the queue do.
+//! Metrics for Prometheus, made from a look at the daemon at each scrape: the rows of the paper's Table 1 for each job, what they
+//! come to for each mounted scene, and what the cache, the workers and the queue do. Labels are bounded: so many jobs, so many
+//! mounts, nothing for each tile or page.
 
-use crate::dispatcher::{Dispatcher, JobFigures};
+use crate::dispatcher::{Dispatcher, JobFigures, SceneFigures};
 use crate::job::JobState;
+use crate::shade_job::Counters;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -25,7 +27,8 @@ impl Page {
     fn gauges(&mut self, name: &str, help: &str, values: impl IntoIterator<Item = (Labels, f64)>) {
         let family = Family::<Labels, Gauge<f64, AtomicU64>>::default();
         for (labels, value) in values {
-            family.get_or_create(&labels).set(value);
+            // Scenes may share name and content.
+            family.get_or_create(&labels).inc_by(value);
         }
         self.0.register(name, help, family);
     }
@@ -53,6 +56,7 @@ fn labels<const N: usize>(pairs: [(&str, String); N]) -> Labels {
 pub fn text(dispatcher: &Dispatcher) -> Result<String, std::fmt::Error> {
     let mut page = Page(Registry::with_prefix("pbgi"));
     daemon(&mut page, dispatcher);
+    scenes(&mut page, &dispatcher.scene_figures());
     jobs(&mut page, &dispatcher.figures(JOBS_ENDED_SHOWN));
     let mut text = String::new();
     encode(&mut text, &page.0)?;
@@ -162,20 +166,97 @@ fn daemon(page: &mut Page, dispatcher: &Dispatcher) {
         .iter()
         .map(|(birth, _, pins)| (slot(birth), f64::from(*pins)));
     page.gauges("worker_frames_pinned", "Frames that the worker holds", pins);
-    let scenes = status.mounts.iter().map(|mount| {
-        let scene = mount
-            .path
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        let labels = labels([("scene", scene), ("build_id", mount.build_id.to_string())]);
-        (labels, mount.pages_loaded as f64)
+}
+
+fn scenes(page: &mut Page, figures: &[SceneFigures]) {
+    let of = |scene: &SceneFigures| {
+        let name = scene.mount.path.file_name().unwrap_or_default();
+        labels([
+            ("scene", name.to_string_lossy().into_owned()),
+            ("build_id", scene.mount.build_id.to_string()),
+        ])
+    };
+    let with = |scene: &SceneFigures, name: &str, value: &str| {
+        let mut all = of(scene);
+        all.push((name.to_owned(), value.to_owned()));
+        all
+    };
+    let kinds = |value: fn(&pbgi_cache::SceneCounters) -> u64| {
+        figures.iter().flat_map(move |scene| {
+            let kinds = ["node", "point"].into_iter().zip(&scene.cache);
+            kinds.map(move |(kind, counters)| (with(scene, "kind", kind), value(counters) as f64))
+        })
+    };
+    page.gauges("scene_pages", "Pages of a scene", kinds(|counters| counters.pages));
+    page.gauges(
+        "scene_frames_resident",
+        "Frames that hold a page of the scene",
+        kinds(|counters| counters.resident),
+    );
+    page.counters(
+        "scene_cache_loads",
+        "Pages of a scene read from disk for the cache",
+        kinds(|counters| counters.loads),
+    );
+    page.counters(
+        "scene_cache_reloads",
+        "Pages of a scene read again after they made room",
+        kinds(|counters| counters.reloads),
+    );
+    page.counters(
+        "scene_cache_evictions",
+        "Pages of a scene that made room",
+        kinds(|counters| counters.evictions),
+    );
+    page.counters(
+        "scene_cache_redundant_reads",
+        "Pages of a scene read while they were resident",
+        kinds(|counters| counters.redundant_reads),
+    );
+    let levels = figures.iter().flat_map(|scene| {
+        let counters = &scene.counters;
+        let levels = [
+            ("local", counters.local_hits),
+            ("shared", counters.shared_hits),
+            ("miss", counters.cache_misses),
+        ];
+        levels.map(|(level, count)| (with(scene, "level", level), count as f64))
     });
     page.counters(
-        "scene_pages_loaded",
-        "Pages of a scene read since it was opened",
-        scenes,
+        "scene_page_requests",
+        "Pages that shading asked a scene for, by where they were found",
+        levels,
+    );
+    let sums = |value: fn(&Counters) -> f64| figures.iter().map(move |scene| (of(scene), value(&scene.counters)));
+    page.counters(
+        "scene_receivers_shaded",
+        "Receivers shaded with a scene",
+        sums(|counters| counters.receivers as f64),
+    );
+    page.counters(
+        "scene_cut_elements",
+        "Elements on the cuts of a scene's receivers",
+        sums(|counters| counters.cut_elements as f64),
+    );
+    page.counters(
+        "scene_nodes_traversed",
+        "Nodes visited to find a scene's cuts",
+        sums(|counters| counters.nodes_visited as f64),
+    );
+    page.counters(
+        "scene_traversal_bytes",
+        "Bytes of the pages that each receiver of a scene touched",
+        sums(|counters| counters.traversal_bytes as f64),
+    );
+    page.counters(
+        "scene_shading_cpu_seconds",
+        "Processor time of shading with a scene",
+        sums(|counters| counters.cpu_nanos as f64 * 1e-9),
+    );
+    page.counters(
+        "scene_shading_io_seconds",
+        "Time that workers waited for a scene's pages",
+        sums(|counters| counters.io_nanos as f64 * 1e-9),
     );
 }
 

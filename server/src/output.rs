@@ -4,7 +4,7 @@ use crate::framebuffer::Planes;
 use crate::job::ShadeTask;
 use crate::roots::Place;
 use pbgi_core::{BuildId, Statistics};
-use pbgi_points::{LayeredImage, Precision};
+use pbgi_points::{LayeredImage, PassThrough, Precision};
 use pbgi_store::{AtomicFile, Overwrite, StoreError};
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -18,6 +18,12 @@ pub struct Picture {
     pub task: ShadeTask,
     /// What it took.
     pub statistics: Statistics,
+    /// The memory that it took at most, by the daemon's settings.
+    pub memory_bytes: u64,
+    /// What the G-buffer's file has for it.
+    pub passed: PassThrough,
+    /// The G-buffer.
+    pub gbuffer: Place,
     /// Where the file is encoded before it goes beside its target.
     pub scratch: PathBuf,
     /// Its target.
@@ -37,7 +43,7 @@ pub fn write(picture: &Picture, planes: Planes, stopped: &dyn Fn() -> bool) -> R
     };
     let text = |error: StoreError| picture.place.hide(&error.to_string());
     let mut file = AtomicFile::create(&picture.place.path, overwrite).map_err(text)?;
-    let image = layered(picture, planes);
+    let image = layered(picture, planes)?;
     let encoded = Encoded(picture.scratch.join(format!("picture-{}.exr", unique())));
     image.write_exr(&encoded.0).map_err(|error| error.to_string())?;
     drop(image);
@@ -89,9 +95,10 @@ fn copy(from: &Path, to: &mut AtomicFile) -> io::Result<u64> {
     Ok(bytes)
 }
 
-fn layered(picture: &Picture, planes: Planes) -> LayeredImage {
-    let mut image = LayeredImage::with_windows(planes.data, planes.display);
-    image.world_to_camera = planes.world_to_camera;
+fn layered(picture: &Picture, planes: Planes) -> Result<LayeredImage, String> {
+    let passed = picture.passed.read(planes.data);
+    let mut image = passed.map_err(|error| picture.gbuffer.hide(&error.to_string()))?;
+    image.display_window = planes.display;
     // Irradiance of bright scenes leaves the range of half precision, and readers compare: floats throughout.
     image.add_rgb("indirect", Precision::Float, &planes.irradiance);
     image.add_rgb("", Precision::Float, &planes.irradiance);
@@ -103,6 +110,7 @@ fn layered(picture: &Picture, planes: Planes) -> LayeredImage {
     let mut set = |name: &str, value: String| image.metadata.insert(format!("pbgi/{name}"), value);
     set("scene", name(&task.scene));
     set("build_id", picture.build_id.to_string());
+    set("memory_bytes", picture.memory_bytes.to_string());
     let settings = &task.settings;
     set("max_solid_angle", settings.max_solid_angle.to_string());
     set("raster_resolution", settings.raster_resolution.to_string());
@@ -117,7 +125,7 @@ fn layered(picture: &Picture, planes: Planes) -> LayeredImage {
             set(row.name, value.to_string());
         }
     }
-    image
+    Ok(image)
 }
 
 /// The last part of a path, as far as an EXR text can hold it.
@@ -133,12 +141,32 @@ mod tests {
     use pbgi_core::ShadeSettings;
     use pbgi_points::Window;
 
+    /// Of a G-buffer with a camera, a Cryptomatte layer, and attributes of its own.
     fn picture(folder: &Path, overwrite: bool) -> Picture {
+        let mut passes = LayeredImage::with_windows(planes().data, planes().display);
+        passes.world_to_ndc = Some(glam::Mat4::from_scale(glam::Vec3::splat(3.0)));
+        passes.add("P.X", Precision::Float, vec![1.0, 2.0]);
+        passes.add("CryptoObject00.R", Precision::Float, vec![1.5e-30, 2.5e30]);
+        let texts = [
+            ("cryptomatte/3cb6acf/name", "CryptoObject"),
+            ("renderer", "other 1.0"),
+            ("pbgi/holes", "99"),
+            ("pbgi/old", "of another picture"),
+        ];
+        passes.metadata = texts.map(|(key, value)| (key.to_owned(), value.to_owned())).into();
+        passes.write_exr(&folder.join("g.exr")).unwrap();
+        let passed = PassThrough::open(&folder.join("g.exr")).unwrap();
+        let gbuffer = Roots::default().read(&folder.join("g.exr")).unwrap();
+        fs::remove_file(folder.join("g.exr")).unwrap();
         Picture {
+            passed,
+            gbuffer,
+            memory_bytes: 1 << 30,
             build_id: BuildId(7),
             task: ShadeTask {
                 scene: "/scenes/cité 日本.pbgi".into(),
                 gbuffer: "/g.exr".into(),
+                passes: Default::default(),
                 output: folder.join("out.exr"),
                 overwrite,
                 settings: ShadeSettings::default(),
@@ -159,7 +187,6 @@ mod tests {
         Planes {
             data: window(-1, 2, 2, 1),
             display: window(0, 0, 10, 10),
-            world_to_camera: None,
             irradiance: vec![[1.0, 2.0, 70_000.0], [0.0; 3]],
             occlusion: vec![0.25, 0.0],
             bent_normal: vec![[0.0, 1.0, 0.0], [0.0; 3]],
@@ -183,7 +210,11 @@ mod tests {
         assert_eq!(image.triple("bentnormal").unwrap(), planes().bent_normal);
         assert_eq!(image.channel("occlusion.Z").unwrap(), planes().occlusion);
         assert_eq!(image.channel("A").unwrap(), planes().coverage);
-        assert_eq!(image.channels.len(), 11);
+        assert_eq!(image.channel("CryptoObject00.R").unwrap(), [1.5e-30, 2.5e30]);
+        assert_eq!(image.channels.len(), 12);
+        assert_eq!(image.world_to_ndc, Some(glam::Mat4::from_scale(glam::Vec3::splat(3.0))));
+        assert_eq!(image.metadata["renderer"], "other 1.0");
+        assert!(!image.metadata.contains_key("pbgi/old"));
         assert_eq!(image.metadata["pbgi/holes"], "1");
         assert_eq!(image.metadata["pbgi/max_dist"], "inf");
         assert_eq!(image.metadata["pbgi/build_id"], BuildId(7).to_string());

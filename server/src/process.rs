@@ -9,9 +9,13 @@ use std::fs::{self, File, OpenOptions};
 use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::UnixListener;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 /// A log longer than this is put aside when the daemon starts.
 const LOG_BYTES_MAX: u64 = 16 << 20;
+/// Signs of life within the time after which the service manager takes us for dead.
+const WATCHDOG_CALLS: u32 = 4;
 
 /// New session, nothing inherited but the three standard streams. To be called before anything is opened.
 pub(crate) fn leave_the_session() {
@@ -92,8 +96,8 @@ pub(crate) fn tell_service_manager(life: Life) {
     let told = match life {
         Life::Ready => sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("serving")]),
         Life::Alive => match sd_notify::watchdog_enabled() {
-            Some(_) => sd_notify::notify(&[NotifyState::Watchdog]),
-            None => return,
+            Some(patience) if is_due(patience / WATCHDOG_CALLS) => sd_notify::notify(&[NotifyState::Watchdog]),
+            _ => return,
         },
         Life::Stopping => sd_notify::notify(&[NotifyState::Stopping, NotifyState::Status("finishing leased tiles")]),
     };
@@ -102,23 +106,22 @@ pub(crate) fn tell_service_manager(life: Life) {
     }
 }
 
+/// Whether so much time has passed since this last said so. A manager that is behind must not be overrun: its socket holds a
+/// few messages only, and waits when it is full.
+fn is_due(interval: Duration) -> bool {
+    static LAST: Mutex<Option<Instant>> = Mutex::new(None);
+    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+    let due = last.is_none_or(|last| last.elapsed() >= interval);
+    if due {
+        *last = Some(Instant::now());
+    }
+    due
+}
+
 /// Lets whoever started us see the end of our output.
 pub(crate) fn detach_stdout() {
     let null = OpenOptions::new().write(true).open("/dev/null");
     if let Err(error) = null.and_then(|null| Ok(dup2_stdout(&null)?)) {
         tracing::warn!(%error, "cannot detach standard output");
     }
-}
-
-/// A panic in the threads that everything rests on ends the process: a supervisor starts it anew, the next start cleans up.
-pub(crate) fn abort_on_core_panic() {
-    let report = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |info| {
-        report(info);
-        let thread = std::thread::current();
-        let name = thread.name().unwrap_or_default();
-        if name == "supervisor" || name.starts_with("loader-") {
-            std::process::abort();
-        }
-    }));
 }

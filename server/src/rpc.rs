@@ -5,6 +5,7 @@
 
 mod accept;
 mod cache;
+mod caught;
 mod convert;
 mod gate;
 mod jobs;
@@ -18,7 +19,8 @@ use crate::error::{JobError, ServerError};
 use crate::job::Request;
 use crate::limits;
 use accept::{Connection, connections};
-use gate::Gate;
+use caught::CatchPanics;
+pub use gate::Gate;
 use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_server::DaemonServiceServer;
 use pbgi_proto::v1::job_service_server::JobServiceServer;
@@ -31,7 +33,6 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, UnixListener};
 use tokio::sync::watch;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::service::InterceptorLayer;
 use tonic::transport::server::Connected;
 use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tonic_health::ServingStatus;
@@ -66,10 +67,10 @@ fn server() -> Server {
 /// The server cannot be set up or fails as a whole.
 pub async fn serve_jobs(
     listener: UnixListener,
+    gate: Gate,
     dispatcher: Arc<Dispatcher>,
     stop: watch::Receiver<bool>,
 ) -> Result<(), ServerError> {
-    let gate = Gate::users(&dispatcher.config.options.access);
     serve_clients(server(), gate, connections(listener), dispatcher, stop).await
 }
 
@@ -80,6 +81,11 @@ pub struct Remote {
 }
 
 impl Remote {
+    /// Who is let in.
+    pub fn gate(&self) -> Gate {
+        self.gate.clone()
+    }
+
     /// Reads certificates, key and token.
     ///
     /// # Errors
@@ -159,7 +165,8 @@ where
         reason: error.to_string(),
     };
     let served = server
-        .layer(InterceptorLayer::new(move |request| gate.check(request)))
+        .layer(CatchPanics)
+        .layer(gate)
         .add_service(health_service)
         .add_service(reflection().build_v1().map_err(setup)?)
         // Python's reflection client speaks this one only.
@@ -209,7 +216,8 @@ pub async fn serve_queue(
     let service = QueueServiceServer::new(queue::Queue::new(dispatcher));
     let gate = Gate::own();
     server()
-        .layer(InterceptorLayer::new(move |request| gate.check(request)))
+        .layer(CatchPanics)
+        .layer(gate)
         .add_service(
             service
                 .max_decoding_message_size(limit)

@@ -7,11 +7,12 @@ use crate::job::ShadeTask;
 use crate::limits;
 use crate::mounts::Mounted;
 use crate::output;
+use crate::roots::Place;
 use crate::scheduler::JobNo;
 use pbgi_cache::JobCounters;
 use pbgi_core::limits::IMAGE_PIXELS_MAX;
-use pbgi_core::{Environment, Statistics};
-use pbgi_points::GBuffer;
+use pbgi_core::{Environment, SceneInfo, Statistics};
+use pbgi_points::{GBuffer, PassThrough, PointsError};
 use pbgi_store::StoreError;
 use std::collections::HashSet;
 use std::os::unix::fs::MetadataExt;
@@ -34,6 +35,10 @@ pub struct Shading {
     pub tiles_left: Vec<u32>,
     /// Tiles that a former run had stored, in the picture already.
     pub tiles_stored: u64,
+    /// What goes from the G-buffer's file into the picture as it is.
+    pub passed: PassThrough,
+    /// The G-buffer.
+    pub gbuffer: Place,
     /// Tells what the tiles are made from: another scene, G-buffer or environment has another one.
     pub fingerprint: String,
     started: Instant,
@@ -134,7 +139,10 @@ pub async fn prepare(
     let (this, task) = (dispatcher.clone(), task.clone());
     let read = tokio::task::spawn_blocking(move || read(&this, job, &task, stored)).await;
     let (mut shading, pixels) = read.map_err(|error| error.to_string())??;
-    let megabytes = (pixels * limits::PICTURE_BYTES_PER_PIXEL).div_ceil(1 << 20).max(1);
+    let passed = shading.passed.channel_count() as u64 * limits::PASSED_BYTES_PER_PIXEL;
+    let megabytes = (pixels * (limits::PICTURE_BYTES_PER_PIXEL + passed))
+        .div_ceil(1 << 20)
+        .max(1);
     let available = dispatcher.config.memory.work_bytes >> 20;
     if megabytes > available {
         return Err(format!(
@@ -166,13 +174,13 @@ fn read(
 ) -> Result<(Shading, u64), String> {
     // Said now, not after the work is done.
     let text = |error: JobError| error.text;
-    let output = dispatcher.roots.write(&task.output, task.overwrite).map_err(text)?;
+    let output = dispatcher.roots().write(&task.output, task.overwrite).map_err(text)?;
     if !task.overwrite && std::fs::symlink_metadata(&output.path).is_ok() {
         let path = task.output.clone();
         return Err(StoreError::Exists { path }.to_string());
     }
     let mounted = dispatcher.open_scene(&task.scene).map_err(text)?;
-    let places = |path: &PathBuf| dispatcher.roots.read(path).map_err(text);
+    let places = |path: &PathBuf| dispatcher.roots().read(path).map_err(text);
     let gbuffer_place = places(&task.gbuffer)?;
     let environment_place = task.environment.as_ref().map(places).transpose()?;
     let environment = task
@@ -182,7 +190,9 @@ fn read(
     let environment = environment.transpose()?;
     let environment_path = environment_place.as_ref().map(|place| place.path.as_path());
     let fingerprint = fingerprint(&mounted, &gbuffer_place.path, environment_path);
-    let gbuffer = GBuffer::read(&gbuffer_place.path).map_err(|error| gbuffer_place.hide(&error.to_string()))?;
+    let hide = |error: PointsError| gbuffer_place.hide(&error.to_string());
+    let passed = PassThrough::open(&gbuffer_place.path).map_err(hide)?;
+    let gbuffer = GBuffer::read_with(&gbuffer_place.path, &task.passes).map_err(hide)?;
     let pixels = gbuffer.pixel_count() as u64;
     if pixels > IMAGE_PIXELS_MAX {
         let path = task.gbuffer.display();
@@ -197,6 +207,8 @@ fn read(
         counters: Counters::default(),
         tiles_left: Vec::new(),
         tiles_stored: 0,
+        passed,
+        gbuffer: gbuffer_place,
         fingerprint,
         started: Instant::now(),
         memory: None,
@@ -261,17 +273,27 @@ pub async fn write(
     let (memory, cache) = dispatcher.peaks(job);
     statistics.peak_memory_bytes = Some(memory as f64);
     statistics.cache_peak_bytes = Some(cache as f64);
+    let Shading {
+        frame,
+        memory,
+        mounted,
+        passed,
+        gbuffer,
+        ..
+    } = shading;
     let picture = output::Picture {
-        build_id: shading.mounted.scene().info().build_id,
+        build_id: mounted.scene().info().build_id,
         task: task.clone(),
         statistics: statistics.clone(),
+        memory_bytes: dispatcher.config.memory.total_bytes,
+        passed,
+        gbuffer,
         scratch: dispatcher.config.options.scratch_dir.clone(),
         place: dispatcher
-            .roots
+            .roots()
             .write(&task.output, task.overwrite)
             .map_err(|error| error.text)?,
     };
-    let Shading { frame, memory, .. } = shading;
     let written = tokio::task::spawn_blocking(move || {
         let written = output::write(&picture, frame.into_planes(), &|| *abort.borrow());
         drop(memory);
@@ -285,7 +307,14 @@ pub async fn write(
 
 pub(crate) fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds: f64) -> Statistics {
     let info = shading.mounted.scene().info();
-    let tiles = &shading.counters;
+    Statistics {
+        holes: Some(shading.frame.holes() as f64),
+        ..tile_statistics(info, &shading.counters, pages, seconds)
+    }
+}
+
+/// What shading tiles of a scene took: every row that does not need to know what they were part of.
+pub(crate) fn tile_statistics(info: &SceneInfo, tiles: &Counters, pages: &JobCounters, seconds: f64) -> Statistics {
     let count = |value: u64| Some(value as f64);
     let ratio = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
     // Loads are counted here, not by workers: one that dies takes its tile's counters with it, but the page was read.
@@ -312,7 +341,6 @@ pub(crate) fn shading_statistics(shading: &Shading, pages: &JobCounters, seconds
         shared_hits: count(tiles.shared_hits),
         shared_hits_other_job: count(tiles.shared_hits_other_job),
         cache_misses: count(misses),
-        holes: count(shading.frame.holes()),
         ..Statistics::default()
     }
 }

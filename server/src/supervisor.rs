@@ -15,9 +15,10 @@ use crate::scheduler::{Death, Seat};
 use children::{Builds, kill};
 use nix::sys::signal::Signal;
 use slot::Slot;
+use std::io;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
-use std::process::{ChildStderr, ChildStdin, ChildStdout, ExitStatus};
+use std::process::{self, ChildStderr, ChildStdin, ChildStdout, ExitStatus};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -73,7 +74,7 @@ enum Command {
 #[derive(Debug)]
 struct BuildOrder {
     id: u64,
-    reply: oneshot::Sender<std::io::Result<BuildChild>>,
+    reply: oneshot::Sender<io::Result<BuildChild>>,
     exit: oneshot::Sender<ExitStatus>,
 }
 
@@ -103,6 +104,8 @@ pub struct Plan {
     pub queue_socket: PathBuf,
     /// This program, for build children.
     pub server_binary: PathBuf,
+    /// How a process is made: [`std::process::Command::spawn`], unless a test refuses it.
+    pub spawn: fn(&mut process::Command) -> io::Result<process::Child>,
 }
 
 /// How others talk to the supervisor.
@@ -143,7 +146,7 @@ impl Handle {
     ///
     /// # Errors
     /// The process cannot be made.
-    pub async fn build(&self, id: u64) -> std::io::Result<BuildChild> {
+    pub async fn build(&self, id: u64) -> io::Result<BuildChild> {
         let (reply, answer) = oneshot::channel();
         let (exit, exit_receiver) = oneshot::channel();
         self.send(Command::Build(BuildOrder { id, reply, exit }));
@@ -282,6 +285,19 @@ impl<N: Nursery + 'static> Supervisor<N> {
             slot.stop(&mut self.nursery);
         }
     }
+}
+
+/// A panic in the threads that everything rests on ends the process: a supervisor starts it anew, the next start cleans up.
+pub fn abort_on_core_panic() {
+    let report = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        report(info);
+        let thread = std::thread::current();
+        let name = thread.name().unwrap_or_default();
+        if name == "supervisor" || name.starts_with("loader-") {
+            std::process::abort();
+        }
+    }));
 }
 
 /// Sends SIGKILL to a child that is not yet waited for.

@@ -3,14 +3,14 @@
 
 mod harness;
 
-use harness::Daemon;
 use harness::site::{Site, check_picture, disguised, work_in_disguise, write_cloud, write_gbuffer};
+use harness::{Daemon, free_port, wait_until};
 use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_client::DaemonServiceClient;
+use pbgi_proto::v1::job_service_client::JobServiceClient;
 use pbgi_proto::v1::queue_service_client::QueueServiceClient;
 use pbgi_proto::v1::submit_job_request::Task;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
-use std::net::TcpListener;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
@@ -133,6 +133,36 @@ async fn jobs_stay_within_their_roots_and_errors_do_not_tell_where_these_are() {
 }
 
 #[tokio::test]
+async fn root_that_is_added_while_the_daemon_runs_can_be_named_and_one_that_is_taken_away_cannot() {
+    let site = site(daemon(|_| String::new()));
+    let folder = site.daemon.folder.path().to_owned();
+    let file = folder.join("server.toml");
+    let old = std::fs::read_to_string(&file).unwrap();
+    std::fs::rename(folder.join("secret"), folder.join("more")).unwrap();
+    let task = || build("in:in.ply", "more:s.pbgi");
+    assert_eq!(
+        site.submit("early", task()).await.unwrap_err().code(),
+        Code::InvalidArgument
+    );
+    let more = format!("[roots.more]\npath = \"{}/more\"\nwrite = true\n", folder.display());
+    std::fs::write(&file, old.clone() + &more).unwrap();
+    let hang_up = |times: usize| {
+        site.daemon.signal("-HUP");
+        let told = || site.daemon.log().matches("roots changed, nothing").count();
+        wait_until("the roots change", || told() == times);
+    };
+    hang_up(1);
+    site.succeed("build", task()).await;
+    std::fs::write(&file, old).unwrap();
+    hang_up(2);
+    assert_eq!(
+        site.submit("late", task()).await.unwrap_err().code(),
+        Code::InvalidArgument
+    );
+    site.daemon.stop();
+}
+
+#[tokio::test]
 async fn mesh_that_names_files_outside_its_root_cannot_have_them() {
     let site = site(daemon(|_| String::new()));
     let folder = site.daemon.folder.path().to_owned();
@@ -169,10 +199,6 @@ async fn mesh_that_names_files_outside_its_root_cannot_have_them() {
     assert_eq!(job.state(), v1::JobState::Failed);
     assert!(job.error.contains("ermission denied"), "{}", job.error);
     site.daemon.stop();
-}
-
-fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
 /// A certificate authority and what it signs.
@@ -213,6 +239,11 @@ async fn call(endpoint: Endpoint, token: Option<&str>) -> Result<v1::DaemonStatu
 async fn tcp_asks_for_a_certificate_of_ours_and_the_token() {
     let (ours, theirs, port) = (Authority::new(), Authority::new(), free_port());
     let token = "a-token-of-more-than-32-characters-for-tests";
+    let looker = "l-token-of-more-than-32-characters-for-tests";
+    let secret = |path: &Path, text: &str| {
+        std::fs::write(path, text).unwrap();
+        std::fs::set_permissions(path, PermissionsExt::from_mode(0o600)).unwrap();
+    };
     let daemon = daemon(|folder| {
         let (cert, key) = ours.sign("localhost");
         for (name, text) in [
@@ -220,15 +251,15 @@ async fn tcp_asks_for_a_certificate_of_ours_and_the_token() {
             ("key", &key),
             ("ca", &ours.pem()),
             ("token", token),
+            ("looker", looker),
         ] {
-            let path = folder.join(name);
-            std::fs::write(&path, text).unwrap();
-            std::fs::set_permissions(path, PermissionsExt::from_mode(0o600)).unwrap();
+            secret(&folder.join(name), text);
         }
         let folder = folder.display();
         format!(
             "[tcp]\naddress = \"127.0.0.1:{port}\"\ncert = \"{folder}/cert\"\nkey = \"{folder}/key\"\n\
-             client_ca = \"{folder}/ca\"\ntoken_file = \"{folder}/token\"\n"
+             client_ca = \"{folder}/ca\"\ntoken_file = \"{folder}/token\"\n\
+             [tcp.tokens.dashboard]\nfile = \"{folder}/looker\"\ncalls = [\"look\"]\n"
         )
     });
     let uri = format!("https://localhost:{port}");
@@ -256,10 +287,42 @@ async fn tcp_asks_for_a_certificate_of_ours_and_the_token() {
     }
     let plain = Endpoint::from_shared(format!("http://localhost:{port}")).unwrap();
     assert!(call(plain, Some(token)).await.is_err());
+    // A token that allows to look allows nothing else.
+    let channel = endpoint(Some(&ours)).connect().await.unwrap();
+    let header: tonic::metadata::MetadataValue<_> = format!("Bearer {looker}").parse().unwrap();
+    let signed = |mut request: Request<()>| {
+        request.metadata_mut().insert("authorization", header.clone());
+        Ok(request)
+    };
+    let mut jobs = JobServiceClient::with_interceptor(channel.clone(), signed);
+    let mut operator = DaemonServiceClient::with_interceptor(channel, signed);
+    assert!(jobs.list_jobs(v1::ListJobsRequest::default()).await.is_ok());
+    let watch = v1::WatchJobRequest {
+        job_id: "x".into(),
+        cancel_on_disconnect: true,
+    };
+    for refused in [
+        jobs.submit_job(v1::SubmitJobRequest::default()).await.err(),
+        jobs.cancel_job(v1::CancelJobRequest::default()).await.err(),
+        jobs.watch_job(watch).await.err(),
+        operator.shutdown(v1::ShutdownRequest {}).await.err(),
+    ] {
+        assert_eq!(refused.unwrap().code(), Code::PermissionDenied);
+    }
+    // A new secret holds without a restart, and the old one does not.
+    secret(&daemon.folder.path().join("token"), wrong);
+    daemon.signal("-HUP");
+    wait_until("the token changes", || daemon.log().contains("tokens changed, nothing"));
+    assert!(call(endpoint(Some(&ours)), Some(wrong)).await.is_ok());
+    assert_eq!(
+        call(endpoint(Some(&ours)), Some(token)).await.unwrap_err(),
+        Code::Unauthenticated
+    );
     // Secrets are in no log, no argument and no variable of the daemon.
     let process = |file: &str| std::fs::read(format!("/proc/{}/{file}", daemon.child.id())).unwrap();
     for text in [daemon.log().into_bytes(), process("cmdline"), process("environ")] {
-        assert!(!String::from_utf8_lossy(&text).contains(token));
+        let text = String::from_utf8_lossy(&text);
+        assert!([token, looker, wrong].iter().all(|secret| !text.contains(secret)));
     }
     daemon.stop();
 }

@@ -3,11 +3,11 @@
 
 mod harness;
 
-use harness::Daemon;
 use harness::site::{Site, disguised, work_in_disguise, write_cloud, write_gbuffer};
+use harness::{Daemon, free_port};
 use pbgi_proto::v1;
+use std::collections::BTreeSet;
 use std::io::{Read, Write};
-use std::net::TcpListener;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::Command;
@@ -49,6 +49,7 @@ async fn jobs_picture_and_metrics_can_be_seen() {
         labels: [("show".to_owned(), "dune".to_owned())].into(),
         ..Default::default()
     };
+    site.hold_after(60);
     site.submit_with("shade", site.shade("a.exr"), options).await.unwrap();
     site.reaches("shade", 60).await;
     let opaque = |body: &[u8]| body.chunks(4).filter(|pixel| pixel[3] == 255).count();
@@ -65,6 +66,7 @@ async fn jobs_picture_and_metrics_can_be_seen() {
         running.contains("pbgi_job_units_done{job=\"shade\",scene=\"s.pbgi\""),
         "{running}"
     );
+    site.release();
     site.wait("shade").await;
     let (_, _, whole) = get(&site.daemon, "/api/jobs/shade/picture", "localhost");
     assert_eq!(opaque(&whole), 512 * 511);
@@ -76,11 +78,22 @@ async fn jobs_picture_and_metrics_can_be_seen() {
         "pbgi_job_redundant_reads",
         "pbgi_cache_frames_resident{pool=\"node\"}",
         "pbgi_jobs_ended_total{state=\"succeeded\"} 2",
-        "pbgi_scene_pages_loaded_total{scene=\"s.pbgi\"",
+        "pbgi_scene_receivers_shaded_total{scene=\"s.pbgi\"",
         "pbgi_healthy{} 1",
         "# EOF",
     ] {
         assert!(metrics.contains(part), "{part} is not in {metrics}");
+    }
+    // Three of each tile, says the worker in disguise.
+    let local = metrics
+        .lines()
+        .find(|line| line.starts_with("pbgi_scene_page_requests_total{scene=\"s.pbgi\"") && line.contains("\"local\""));
+    assert!(local.unwrap().ends_with(" 768.0"), "{local:?}");
+    for name in dashboard_names() {
+        assert!(
+            [&running, &metrics].iter().any(|text| has(text, &name)),
+            "the dashboard asks for {name}, which no scrape has"
+        );
     }
     let jobs: serde_json::Value = serde_json::from_str(&text(&site.daemon, "/api/jobs")).unwrap();
     assert_eq!(
@@ -102,9 +115,38 @@ async fn jobs_picture_and_metrics_can_be_seen() {
     site.daemon.stop();
 }
 
+/// The queries of the dashboard.
+fn dashboard_queries() -> Vec<String> {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/grafana-dashboard.json");
+    let dashboard: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
+    let panels = dashboard["panels"].as_array().unwrap();
+    let targets = panels
+        .iter()
+        .flat_map(|panel| panel["targets"].as_array().into_iter().flatten());
+    targets
+        .map(|target| target["expr"].as_str().unwrap().to_owned())
+        .collect()
+}
+
+/// The metrics that the dashboard asks for.
+fn dashboard_names() -> BTreeSet<String> {
+    let mut names = BTreeSet::new();
+    for query in dashboard_queries() {
+        let words = query.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '_');
+        names.extend(words.filter(|word| word.starts_with("pbgi_")).map(ToOwned::to_owned));
+    }
+    assert!(names.len() >= 24, "{names:?}");
+    names
+}
+
+/// Whether a scrape has a value under this name.
+fn has(scrape: &str, name: &str) -> bool {
+    scrape.lines().any(|line| line.split(['{', ' ']).next() == Some(name))
+}
+
 /// A site whose page is on a loopback port as well.
 fn site_on_tcp() -> (Site, u16) {
-    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let port = free_port();
     let daemon = Daemon::start(disguised, |command| {
         let state = command
             .get_args()
@@ -203,7 +245,7 @@ async fn every_query_of_the_dashboard_is_answered_by_a_real_prometheus() {
         .replace("127.0.0.1:9464", &format!("127.0.0.1:{port}"))
         .replace("15s", "1s");
     std::fs::write(folder.join("prometheus.yml"), config).unwrap();
-    let api = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let api = free_port();
     let mut prometheus = Command::new("prometheus")
         .arg(format!("--config.file={}", folder.join("prometheus.yml").display()))
         .arg(format!("--storage.tsdb.path={}", folder.join("data").display()))
@@ -211,15 +253,7 @@ async fn every_query_of_the_dashboard_is_answered_by_a_real_prometheus() {
         .stderr(std::process::Stdio::null())
         .spawn()
         .unwrap();
-    let dashboard = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/grafana-dashboard.json");
-    let dashboard: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(dashboard).unwrap()).unwrap();
-    let panels = dashboard["panels"].as_array().unwrap();
-    let targets = panels
-        .iter()
-        .flat_map(|panel| panel["targets"].as_array().into_iter().flatten());
-    let queries: Vec<String> = targets
-        .map(|target| target["expr"].as_str().unwrap().to_owned())
-        .collect();
+    let queries = dashboard_queries();
     assert!(queries.len() >= 12, "{queries:?}");
     let ask = |query: &str| {
         let mut stream = std::net::TcpStream::connect(("127.0.0.1", api)).ok()?;

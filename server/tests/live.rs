@@ -3,6 +3,7 @@
 
 mod harness;
 
+use harness::PATIENCE;
 use harness::site::{Site, work_in_disguise};
 use pbgi_proto::v1;
 use pbgi_proto::v1::scene_service_client::SceneServiceClient;
@@ -83,7 +84,7 @@ async fn receivers_are_answered_in_order_and_the_stream_ends_with_them() {
         .unwrap()
         .into_inner();
     assert!(warmed.pages > 1 && warmed.bytes > 20_000 * 32, "{warmed:?}");
-    let deadline = tokio::time::Instant::now() + Duration::from_secs(5);
+    let deadline = tokio::time::Instant::now() + PATIENCE;
     loop {
         match scenes.drop_scene(v1::DropSceneRequest { scene: scene() }).await {
             Ok(answer) => break assert!(answer.into_inner().dropped),

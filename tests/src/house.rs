@@ -9,6 +9,8 @@ use std::time::{Duration, Instant};
 
 /// Options of the daemon that most tests share: small, with two workers.
 pub const DAEMON: &str = "--memory 256M --workers 2";
+/// How long anything is waited for that must come: far longer than it takes, for a machine that does much else.
+pub const PATIENCE: Duration = Duration::from_secs(60);
 
 /// The workspace's root.
 pub fn workspace_root() -> PathBuf {
@@ -231,7 +233,14 @@ impl House {
             let name = command.split(' ').next().unwrap_or_default();
             name.ends_with(program) && !command.contains("build-child")
         };
-        found.filter(|(_, command)| mine(command)).map(|(pid, _)| pid).collect()
+        let found: Vec<i32> = found.filter(|(_, command)| mine(command)).map(|(pid, _)| pid).collect();
+        let parent = |pid: i32| {
+            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+            stat.rsplit(')').next()?.split_whitespace().nth(1)?.parse::<i32>().ok()
+        };
+        // Between fork and exec a worker has the command line of its daemon.
+        let child = |pid: i32| parent(pid).is_some_and(|parent| found.contains(&parent));
+        found.iter().copied().filter(|&pid| !child(pid)).collect()
     }
 
     /// Shared memory segments that the house's state files name: state file and segment.
@@ -258,20 +267,37 @@ impl House {
         Some(share / 100.0)
     }
 
-    /// Kills workers while a shading job has tiles outstanding, by turns one and all of them. Returns false if the job
-    /// was over too soon: then nobody was killed.
-    pub fn kill_workers(&self, all: bool) -> bool {
-        // They are stopped first, so that what is outstanding stays so while we look.
+    /// Stops the workers if a shading job has some tiles done and others outstanding, and returns their process ids. They
+    /// are stopped before we look, so that what is outstanding stays so; without such a job they go on.
+    pub fn stop_workers(&self) -> Option<Vec<i32>> {
         let workers = self.running("pbgi-worker");
         for &pid in &workers {
             signal(pid, Signal::SIGSTOP);
         }
-        let outstanding = !workers.is_empty() && self.share().is_some_and(|share| share > 0.0 && share < 1.0);
-        for (index, &pid) in workers.iter().enumerate() {
-            let kill = outstanding && (all || index == 0);
-            signal(pid, if kill { Signal::SIGKILL } else { Signal::SIGCONT });
+        if !workers.is_empty() && self.share().is_some_and(|share| share > 0.0 && share < 1.0) {
+            return Some(workers);
         }
-        outstanding
+        for &pid in &workers {
+            signal(pid, Signal::SIGCONT);
+        }
+        None
+    }
+
+    /// Kills workers while a shading job has tiles outstanding, one or all of them, and returns the process ids of those
+    /// that there were. Nobody is killed without such a job.
+    pub fn kill_workers(&self, all: bool) -> Option<Vec<i32>> {
+        let workers = self.stop_workers()?;
+        for (index, &pid) in workers.iter().enumerate() {
+            signal(
+                pid,
+                if all || index == 0 {
+                    Signal::SIGKILL
+                } else {
+                    Signal::SIGCONT
+                },
+            );
+        }
+        Some(workers)
     }
 
     /// Ends every daemon of the house in good order.
@@ -279,7 +305,7 @@ impl House {
         for pid in self.running("pbgi-server") {
             signal(pid, Signal::SIGTERM);
         }
-        wait_for(Duration::from_secs(10), || self.processes().is_empty());
+        wait_for(PATIENCE, || self.processes().is_empty());
     }
 }
 

@@ -16,7 +16,7 @@ mod picture;
 mod scene;
 
 pub use disk::forget;
-pub use house::{DAEMON, House, Job, Run, program, signal, wait_for, workspace_root};
+pub use house::{DAEMON, House, Job, PATIENCE, Run, program, signal, wait_for, workspace_root};
 pub use nix::sys::signal::Signal;
 pub use picture::{Picture, assert_same, assert_same_values, relative_rms, rms};
 pub use scene::{flip_bit, page_count};

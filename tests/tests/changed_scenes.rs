@@ -4,9 +4,8 @@
 
 use pbgi_core::PageKind;
 use pbgi_store::Scene;
-use pbgi_tests::{DAEMON, House, Picture, assert_same, flip_bit, wait_for};
+use pbgi_tests::{DAEMON, House, PATIENCE, Picture, assert_same, flip_bit, wait_for};
 use std::fs;
-use std::time::Duration;
 
 /// A daemon whose cache is too small for the scene, so that it reads pages again.
 const TIGHT: &str = "--memory 58M --workers 2";
@@ -44,7 +43,7 @@ fn a_file_cut_or_edited_while_it_is_open_fails_its_jobs_and_no_others() {
         .page_count(PageKind::Node);
     for round in 0..20 {
         let mut job = house.start(&shade("small.pbgi", "bad.exr").replace("g.exr", "large.exr"));
-        let under_way = wait_for(Duration::from_secs(30), || {
+        let under_way = wait_for(PATIENCE, || {
             house.share().is_some_and(|share| share > 0.0) || !job.runs()
         });
         assert!(under_way && job.runs(), "the job was over too soon");

@@ -1,12 +1,10 @@
 //! Processes that die: what is left of them, and who does their work.
 
-#![allow(clippy::unwrap_used, reason = "tests")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
-use pbgi_tests::{DAEMON, House, Picture, Signal, assert_same, signal, wait_for};
+use pbgi_tests::{DAEMON, House, PATIENCE, Picture, Signal, assert_same, signal, wait_for};
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
-
-const WAIT: Duration = Duration::from_secs(10);
 
 #[test]
 fn the_tile_of_a_killed_worker_is_done_by_another() {
@@ -14,15 +12,15 @@ fn the_tile_of_a_killed_worker_is_done_by_another() {
     house.furnish(60_000, "128x128");
     let line = |run: &str| format!("shade demo.pbgi --gbuffer g.exr -o {run}.exr {DAEMON}");
     let mut job = house.start(&line("killed"));
-    let mut before = vec![];
-    let killed = wait_for(Duration::from_secs(30), || {
-        before = house.running("pbgi-worker");
-        house.kill_workers(false) || !job.runs()
+    let mut before = None;
+    wait_for(PATIENCE, || {
+        before = house.kill_workers(false);
+        before.is_some() || !job.runs()
     });
-    assert!(killed && job.runs(), "the job was over before a worker was killed");
+    let before = before.expect("the job was over before a worker was killed");
     job.end().ok();
     // The dead one has a successor, and nobody is left over.
-    assert!(wait_for(WAIT, || house.running("pbgi-worker").len() == 2));
+    assert!(wait_for(PATIENCE, || house.running("pbgi-worker").len() == 2));
     let after = house.running("pbgi-worker");
     let survivors = before.iter().filter(|pid| after.contains(pid)).count();
     assert_eq!((before.len(), survivors), (2, 1));
@@ -43,10 +41,13 @@ fn a_killed_daemon_leaves_no_worker_no_picture_and_no_segment() {
     std::fs::create_dir(house.path("out")).unwrap();
     let line = format!("shade demo.pbgi --gbuffer g.exr -o out/o.exr {DAEMON}");
     let mut job = house.start(&line);
-    let under_way = wait_for(Duration::from_secs(30), || {
-        house.share().is_some_and(|share| share > 0.0 && share < 1.0) || !job.runs()
+    // Stopped workers die with their daemon like others.
+    let mut under_way = false;
+    wait_for(PATIENCE, || {
+        under_way = house.stop_workers().is_some();
+        under_way || !job.runs()
     });
-    assert!(under_way && job.runs(), "the job was over before the daemon was killed");
+    assert!(under_way, "the job was over before the daemon was killed");
     let daemons = house.running("pbgi-server");
     assert_eq!(daemons.len(), 1);
     let segments = house.segments();
@@ -54,7 +55,7 @@ fn a_killed_daemon_leaves_no_worker_no_picture_and_no_segment() {
     assert!(segments[0].1.metadata().is_ok(), "{segments:?}");
     signal(daemons[0], Signal::SIGKILL);
     assert!(
-        wait_for(WAIT, || house.running("pbgi-worker").is_empty()),
+        wait_for(PATIENCE, || house.running("pbgi-worker").is_empty()),
         "workers outlived their daemon"
     );
     let run = job.end();
@@ -102,7 +103,7 @@ fn a_tile_that_kills_three_workers_fails_its_job_and_no_other() {
         for pid in shading(&house) {
             signal(pid, Signal::SIGABRT);
             assert!(
-                wait_for(WAIT, || !house.running("pbgi-worker").contains(&pid)),
+                wait_for(PATIENCE, || !house.running("pbgi-worker").contains(&pid)),
                 "{pid} lives"
             );
             deaths += 1;
@@ -130,7 +131,7 @@ fn hung_workers(count: usize) {
     for round in 0..count {
         let mut job = house.start(&format!("shade demo.pbgi --gbuffer g.exr -o hung{round}.exr {DAEMON}"));
         let mut hung = None;
-        let stopped = wait_for(Duration::from_secs(30), || {
+        let stopped = wait_for(PATIENCE, || {
             hung = shading(&house).first().copied();
             hung.is_some() || !job.runs()
         });
@@ -140,9 +141,7 @@ fn hung_workers(count: usize) {
         let start = Instant::now();
         // Ten seconds without a heartbeat, then it is killed, then its tile goes to another.
         assert!(
-            wait_for(Duration::from_secs(15), || !house
-                .running("pbgi-worker")
-                .contains(&hung)),
+            wait_for(PATIENCE, || !house.running("pbgi-worker").contains(&hung)),
             "the hung worker lives"
         );
         let seconds = start.elapsed().as_secs_f64();
@@ -211,14 +210,17 @@ fn twenty_killed_daemons_leave_no_worker_and_no_partial_picture() {
     let (mut workers_gone, mut ready) = (Duration::ZERO, Duration::ZERO);
     for round in 0..20u64 {
         let mut job = house.start(&format!("shade demo.pbgi --gbuffer g.exr -o out/o{round}.exr {DAEMON}"));
-        let under_way = wait_for(Duration::from_secs(30), || !shading(&house).is_empty() || !job.runs());
+        let under_way = wait_for(PATIENCE, || !shading(&house).is_empty() || !job.runs());
         assert!(under_way && job.runs(), "the job was over before the daemon was killed");
         std::thread::sleep(Duration::from_millis(37 * (round % 7)));
         for pid in house.running("pbgi-server") {
             signal(pid, Signal::SIGKILL);
         }
         let start = Instant::now();
-        assert!(wait_for(WAIT, || house.running("pbgi-worker").is_empty()), "orphans");
+        assert!(
+            wait_for(PATIENCE, || house.running("pbgi-worker").is_empty()),
+            "orphans"
+        );
         workers_gone = workers_gone.max(start.elapsed());
         job.end().fails_naming(&["error: "]);
         assert_eq!(
@@ -249,7 +251,7 @@ fn a_daemon_killed_at_any_moment_of_its_start_leaves_at_most_a_segment_that_the_
     let mut seen = BTreeSet::new();
     for round in 0..20u64 {
         let mut start = house.start(&format!("info demo.pbgi {DAEMON}"));
-        wait_for(WAIT, || !house.running("pbgi-server").is_empty() || !start.runs());
+        wait_for(PATIENCE, || !house.running("pbgi-server").is_empty() || !start.runs());
         std::thread::sleep(Duration::from_micros(1_500 * round));
         for pid in house.running("pbgi-server") {
             signal(pid, Signal::SIGKILL);
@@ -257,7 +259,7 @@ fn a_daemon_killed_at_any_moment_of_its_start_leaves_at_most_a_segment_that_the_
         seen.extend(house.segments().into_iter().map(|(_, segment)| segment));
         start.end();
         assert!(
-            wait_for(WAIT, || house.processes().is_empty()),
+            wait_for(PATIENCE, || house.processes().is_empty()),
             "{:?}",
             house.processes()
         );
@@ -281,13 +283,13 @@ fn a_segment_that_somebody_removes_lets_the_job_finish_and_the_daemon_leave() {
     let line = |run: &str| format!("shade demo.pbgi --gbuffer g.exr -o {run}.exr {DAEMON}");
     house.line(&line("calm")).ok();
     let mut job = house.start(&line("removed"));
-    let under_way = wait_for(Duration::from_secs(30), || !shading(&house).is_empty() || !job.runs());
+    let under_way = wait_for(PATIENCE, || !shading(&house).is_empty() || !job.runs());
     assert!(under_way && job.runs(), "the job was over too soon");
     let daemons = house.running("pbgi-server");
     std::fs::remove_file(&house.segments()[0].1).unwrap();
     let run = job.end();
     assert!(
-        wait_for(Duration::from_secs(40), || house.running("pbgi-server").is_empty()),
+        wait_for(PATIENCE, || house.running("pbgi-server").is_empty()),
         "a daemon without a segment stays"
     );
     // What was leased was finished; the rest is for the next daemon.

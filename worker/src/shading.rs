@@ -8,7 +8,8 @@ use crate::tile::{Tile, values};
 use nix::time::{ClockId, clock_gettime};
 use pbgi_proto::v1;
 use pbgi_proto::v1::complete_tile_request::Outcome;
-use pbgi_shade::{ShadeCounters, ShadeError, Shaded, Shader, SourceError};
+use pbgi_shade::{Hit, ShadeCounters, ShadeError, Shaded, Shader, SourceError, Tracer};
+use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
@@ -63,8 +64,46 @@ struct Bench {
 /// A task made ready.
 struct Prepared {
     task_id: u64,
-    shader: Shader,
+    tool: Tool,
     view: SceneView,
+}
+
+/// What a task's tiles are worked on with.
+enum Tool {
+    Shader(Box<Shader>),
+    Tracer(Box<Tracer>),
+}
+
+impl Tool {
+    fn counters(&self) -> ShadeCounters {
+        match self {
+            Self::Shader(shader) => shader.counters(),
+            Self::Tracer(tracer) => tracer.counters(),
+        }
+    }
+
+    /// Works on a group of a tile; its values are appended to `bytes`.
+    fn work(
+        &mut self,
+        tile: &Tile,
+        group: Range<usize>,
+        source: &mut PageSource<'_>,
+        bytes: &mut Vec<u8>,
+    ) -> Result<(), ShadeError> {
+        match self {
+            Self::Shader(shader) => {
+                let mut shaded = vec![Shaded::default(); group.len()];
+                shader.shade_group(&tile.receivers[group], source, &mut shaded)?;
+                bytes.extend(values(&shaded));
+            }
+            Self::Tracer(tracer) => {
+                let mut hits = vec![Hit::default(); group.len()];
+                tracer.trace_group(tile.rays(group), source, &mut hits)?;
+                bytes.extend(values(&hits));
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Bench {
@@ -76,25 +115,23 @@ impl Bench {
             return Some(failure(&error, None));
         }
         let prepared = self.scenes.first_mut()?;
-        let before = prepared.shader.counters();
+        let before = prepared.tool.counters();
         let cpu_before = thread_cpu_nanos();
-        let mut shaded = vec![Shaded::default(); tile.receivers.len()];
+        let mut bytes = Vec::new();
         let mut source = PageSource::new(&mut self.pages, &mut prepared.view, task.id);
         for group in &tile.groups {
             if abandoned.load(Ordering::Relaxed) {
                 return None;
             }
-            let receivers = &tile.receivers[group.clone()];
-            let results = &mut shaded[group.clone()];
-            if let Err(error) = prepared.shader.shade_group(receivers, &mut source, results) {
+            if let Err(error) = prepared.tool.work(tile, group.clone(), &mut source, &mut bytes) {
                 return Some(failure(&error, source.take_fault()));
             }
         }
         let mut counters = source.counters();
         counters.cpu_nanos = thread_cpu_nanos().saturating_sub(cpu_before);
-        add_shading(&mut counters, &before, &prepared.shader.counters());
+        add_shading(&mut counters, &before, &prepared.tool.counters());
         Some(Outcome::Result(v1::TileResult {
-            values: values(&shaded),
+            values: bytes,
             counters: Some(counters),
         }))
     }
@@ -105,13 +142,19 @@ impl Bench {
             self.scenes[..=index].rotate_right(1);
             return Ok(());
         }
-        let shader = Shader::new(&task.scene, task.settings, task.environment.as_ref())?;
+        let tool = match task.pixel_angle {
+            None => {
+                let shader = Shader::new(&task.scene, task.settings, task.environment.as_ref())?;
+                Tool::Shader(Box::new(shader))
+            }
+            Some(angle) => Tool::Tracer(Box::new(Tracer::new(&task.scene, angle))),
+        };
         self.scenes.truncate(TASKS_KEPT - 1);
         self.scenes.insert(
             0,
             Prepared {
                 task_id: task.id,
-                shader,
+                tool,
                 view: SceneView::new(&task.scene, task.mount),
             },
         );

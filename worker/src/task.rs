@@ -13,6 +13,8 @@ pub(crate) struct Task {
     pub(crate) mount: MountId,
     pub(crate) settings: ShadeSettings,
     pub(crate) environment: Option<Environment>,
+    /// Angle between neighbouring rays, radians, where rays are traced.
+    pub(crate) pixel_angle: Option<f32>,
 }
 
 impl Task {
@@ -30,8 +32,17 @@ impl Task {
             scene: scene_info(scene)?,
             mount,
             settings: shade_settings(wire.settings.as_ref())?,
+            pixel_angle: wire.rays.map(|rays| pixel_angle(rays.pixel_angle)).transpose()?,
             environment: environment(wire.environment_width, wire.environment_height, &wire.environment)?,
         })
+    }
+}
+
+fn pixel_angle(angle: f32) -> Result<f32, String> {
+    if angle > 0.0 && angle < 1.0 {
+        Ok(angle)
+    } else {
+        Err(format!("a pixel angle of {angle}"))
     }
 }
 
@@ -78,6 +89,8 @@ fn scene_info(wire: &v1::SceneInfo) -> Result<SceneInfo, String> {
         bounds,
         quantizer,
         radius_max: wire.radius_max,
+        // Positions on the wire are relative to it already.
+        origin: [0.0; 3],
         settings,
     })
 }
@@ -148,6 +161,8 @@ mod tests {
             Task::from_wire(1, task).unwrap_err()
         };
         assert!(refused(|task| task.scene = None).contains("scene"));
+        let angle = refused(|task| task.rays = Some(v1::RayTracing { pixel_angle: f32::NAN }));
+        assert!(angle.contains("pixel angle"));
         assert!(refused(|task| task.mount_slot = 64).contains("mount slot"));
         assert!(refused(|task| task.mount_generation = 1 << 16).contains("generation"));
         assert!(refused(|task| task.environment = vec![0; 5]).contains("5 bytes"));

@@ -1,11 +1,12 @@
 //! A tile on the wire: receivers in, shaded values out.
 
 use pbgi_proto::v1;
-use pbgi_shade::{Receiver, Shaded};
+use pbgi_shade::{Ray, Receiver};
 use std::ops::Range;
 
 // Records cross the wire as they lie in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
+const _: () = assert!(size_of::<Receiver>() == size_of::<Ray>());
 
 /// A lease's work.
 #[derive(Debug)]
@@ -19,6 +20,11 @@ pub(crate) struct Tile {
 }
 
 impl Tile {
+    /// Some of its receivers, which are rays.
+    pub(crate) fn rays(&self, group: Range<usize>) -> &[Ray] {
+        bytemuck::cast_slice(&self.receivers[group])
+    }
+
     pub(crate) fn from_wire(lease: &v1::Lease) -> Result<Self, String> {
         if !lease.receivers.len().is_multiple_of(size_of::<Receiver>()) {
             return Err(format!("a tile of {} bytes", lease.receivers.len()));
@@ -46,13 +52,14 @@ impl Tile {
 }
 
 /// Results as the queue takes them.
-pub(crate) fn values(shaded: &[Shaded]) -> Vec<u8> {
+pub(crate) fn values<T: bytemuck::NoUninit>(shaded: &[T]) -> Vec<u8> {
     bytemuck::cast_slice(shaded).to_vec()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use pbgi_shade::Shaded;
 
     fn lease(receivers: usize, group_lengths: Vec<u32>) -> v1::Lease {
         let numbers = (0..receivers * 6).flat_map(|i| (i as f32).to_le_bytes());

@@ -30,6 +30,7 @@ fn scene() -> SceneInfo {
         bounds: None,
         quantizer: None,
         radius_max: 1.0,
+        origin: [0.0; 3],
         settings: BuildSettings {
             nodes_per_page: RECORDS_PER_PAGE,
             points_per_page: RECORDS_PER_PAGE,

@@ -7,7 +7,7 @@ use pbgi_client::JobOptions;
 use pbgi_client::private::PrivateOptions;
 use pbgi_client::size::parse_bytes;
 use pbgi_core::{BuildSettings, ShadeSettings, limits};
-use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, ViewDensity};
+use pbgi_points::{CloudOptions, Density, Facing, GBufferOptions, InvalidPoints, Radius, Space, ViewDensity};
 use std::path::PathBuf;
 
 /// Which daemon.
@@ -45,6 +45,14 @@ pub(crate) struct RunningArgs {
     /// The daemon's address, unix:/path/to/jobs.sock; without it, your private daemons
     #[arg(long, value_name = "URI")]
     pub(crate) server: Option<String>,
+}
+
+/// How answers are printed.
+#[derive(Args, Clone, Copy, Debug, Default)]
+pub(crate) struct FormArgs {
+    /// Print JSON instead of a table
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 /// Where results go.
@@ -124,14 +132,11 @@ impl DensityArgs {
 /// How point clouds are read.
 #[derive(Args, Clone, Copy, Debug, Default)]
 #[command(next_help_heading = "Point clouds")]
-pub(crate) struct CloudArgs {
+pub(crate) struct ReadingArgs {
     /// Estimate normals from neighbouring points, turned up, out (away from the middle) or to a viewpoint X,Y,Z
     /// [default: up for LAS and LAZ, else out]
     #[arg(long, value_name = "SIDE", num_args = 0..=1, require_equals = true, default_missing_value = "auto", value_parser = facing)]
     estimate_normals: Option<Facing>,
-    /// Radius of points whose file has none: auto, from their distances, or a length
-    #[arg(long, allow_negative_numbers = true, value_name = "R", value_parser = radius)]
-    radius: Option<Radius>,
     /// Subtract X,Y,Z (in the file's axes) from positions that are too large for 32-bit floats [default: chosen from LAS headers]
     #[arg(long, allow_negative_numbers = true, value_name = "X,Y,Z", value_parser = triple::<f64>)]
     origin: Option<[f64; 3]>,
@@ -143,14 +148,33 @@ pub(crate) struct CloudArgs {
     recompute_bounds: bool,
 }
 
-impl CloudArgs {
+impl ReadingArgs {
     pub(crate) fn options(&self) -> CloudOptions {
         CloudOptions {
             origin: self.origin,
             invalid_points: self.invalid_points.unwrap_or_default(),
             recompute_bounds: self.recompute_bounds,
             estimate_normals: self.estimate_normals,
+            radius: None,
+        }
+    }
+}
+
+/// How point clouds become points of a scene.
+#[derive(Args, Clone, Copy, Debug, Default)]
+pub(crate) struct CloudArgs {
+    #[command(flatten)]
+    reading: ReadingArgs,
+    /// Radius of points whose file has none: auto, from their distances, or a length
+    #[arg(long, allow_negative_numbers = true, value_name = "R", value_parser = radius, help_heading = "Point clouds")]
+    radius: Option<Radius>,
+}
+
+impl CloudArgs {
+    pub(crate) fn options(&self) -> CloudOptions {
+        CloudOptions {
             radius: self.radius,
+            ..self.reading.options()
         }
     }
 
@@ -240,6 +264,41 @@ impl QualityArgs {
     }
 }
 
+/// How a G-buffer is read.
+#[derive(Args, Debug)]
+#[command(next_help_heading = "G-buffer")]
+pub(crate) struct PassArgs {
+    /// Layer of the positions [default: found by its usual names: P, Pworld, WP, position, ViewLayer.Position, ...]
+    #[arg(long, value_name = "LAYER")]
+    position: Option<String>,
+    /// Layer of the normals [default: found by its usual names: N, Nworld, normal, normals, ViewLayer.Normal, ...]
+    #[arg(long, value_name = "LAYER")]
+    normal: Option<String>,
+    /// Space of both: checked (world space, refused if it is plainly a camera's), world (not checked), or camera (converted
+    /// with the file's worldToCamera)
+    #[arg(long, value_name = "SPACE", default_value = "checked", value_parser = space)]
+    space: Space,
+}
+
+impl PassArgs {
+    pub(crate) fn options(&self) -> GBufferOptions {
+        GBufferOptions {
+            position: self.position.clone(),
+            normal: self.normal.clone(),
+            space: self.space,
+        }
+    }
+}
+
+fn space(text: &str) -> Result<Space, String> {
+    match text {
+        "checked" => Ok(Space::Checked),
+        "world" => Ok(Space::World),
+        "camera" => Ok(Space::Camera),
+        _ => Err("write checked, world or camera".to_owned()),
+    }
+}
+
 /// How octrees are built.
 #[derive(Args, Debug, Default)]
 #[command(next_help_heading = "Octree")]
@@ -284,6 +343,72 @@ pub(crate) struct CameraArgs {
     pub(crate) size: Option<Size>,
 }
 
+/// How a camera sees a scene that has no meshes.
+#[derive(Args, Clone, Debug, Default)]
+#[command(next_help_heading = "Camera")]
+pub(crate) struct SeenArgs {
+    /// The camera: auto, an overview of the scene, or a number, of the cameras of --camera-file [default: auto]
+    #[arg(long, value_name = "auto|N")]
+    pub(crate) camera: Option<String>,
+    /// A mesh whose camera it is, such as the one that the scene was built of: .glb, .gltf
+    #[arg(long, value_name = "FILE", conflicts_with = "eye")]
+    pub(crate) camera_file: Option<PathBuf>,
+    /// Where the camera stands, world units
+    #[arg(long, allow_hyphen_values = true, value_name = "X,Y,Z", value_parser = triple::<f32>, conflicts_with = "camera")]
+    pub(crate) eye: Option<[f32; 3]>,
+    /// What it looks at [default: the middle of the scene]
+    #[arg(long, allow_hyphen_values = true, value_name = "X,Y,Z", value_parser = triple::<f32>, requires = "eye")]
+    pub(crate) look_at: Option<[f32; 3]>,
+    /// Height of what it sees, degrees
+    #[arg(long, value_name = "DEGREES", default_value_t = 45.0, value_parser = field_of_view, requires = "eye")]
+    pub(crate) fov: f32,
+    /// Which way is up
+    #[arg(long, value_name = "x|y|z", default_value = "y", value_parser = ["x", "y", "z"], requires = "eye")]
+    pub(crate) up: String,
+    /// Pixels of the picture [default: 960x540]
+    #[arg(long, value_name = "WxH", value_parser = picture_size)]
+    size: Option<Size>,
+}
+
+impl SeenArgs {
+    /// Whether any of it was asked for.
+    pub(crate) fn is_given(&self) -> bool {
+        self.camera.is_some() || self.camera_file.is_some() || self.eye.is_some()
+    }
+
+    pub(crate) fn size(&self) -> Size {
+        self.size.unwrap_or(Size {
+            width: 960,
+            height: 540,
+        })
+    }
+
+    pub(crate) fn up(&self) -> [f32; 3] {
+        match self.up.as_str() {
+            "x" => [1.0, 0.0, 0.0],
+            "z" => [0.0, 0.0, 1.0],
+            _ => [0.0, 1.0, 0.0],
+        }
+    }
+
+    /// Checks `--camera`: a number goes with a file, `auto` with none.
+    pub(crate) fn camera_number(&self) -> Result<usize, Failure> {
+        let fault = || Failure::usage("--camera is auto, or with --camera-file the number of one of its cameras");
+        match (self.camera.as_deref(), &self.camera_file) {
+            (None | Some("auto"), None) | (None, Some(_)) => Ok(0),
+            (Some(number), Some(_)) => number.parse().map_err(|_| fault()),
+            (Some(_), None) => Err(fault()),
+        }
+    }
+}
+
+fn field_of_view(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(degrees) if (1.0..=170.0).contains(&degrees) => Ok(degrees),
+        _ => Err("it must be from 1 to 170 degrees".to_owned()),
+    }
+}
+
 /// Pixels of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Size {
@@ -309,7 +434,7 @@ pub(crate) fn picture_size(text: &str) -> Result<Size, String> {
     Ok(size)
 }
 
-fn positive(text: &str) -> Result<f32, String> {
+pub(crate) fn positive(text: &str) -> Result<f32, String> {
     match text.parse::<f32>() {
         Ok(value) if value > 0.0 && value.is_finite() => Ok(value),
         _ => Err("it must be a number above 0".to_owned()),

@@ -1,10 +1,10 @@
 //! What the daemons' page caches hold: `cache`.
 
-use super::args::RunningArgs;
+use super::args::{FormArgs, RunningArgs};
 use super::failure::Failure;
 use super::interrupt::Interrupt;
 use super::session;
-use super::summary::grouped;
+use super::summary::{at_address, grouped};
 use clap::Args;
 use pbgi_client::size::format_bytes;
 use pbgi_client::{CachePool, CacheStatus, CachedFile, Client};
@@ -19,6 +19,8 @@ daemon more --memory. Redundant reads, loads of a page that was there, are 0 unl
 #[command(after_help = NOTES)]
 pub(crate) struct CacheArgs {
     #[command(flatten)]
+    form: FormArgs,
+    #[command(flatten)]
     running: RunningArgs,
 }
 
@@ -31,7 +33,12 @@ pub(crate) async fn cache(args: CacheArgs, interrupt: &Interrupt) -> Result<(), 
         }
         Ok(answers)
     });
-    for (client, status) in answers.await? {
+    let answers = answers.await?;
+    if args.form.json {
+        println!("{}", at_address(&answers));
+        return Ok(());
+    }
+    for (client, status) in answers {
         print!("{}", describe(&client, &status));
     }
     Ok(())

@@ -26,9 +26,8 @@ pub(crate) fn composite(
     let direct = gbuffer.direct.clone().unwrap_or_else(black);
     let emission = gbuffer.emission.clone().unwrap_or_else(black);
     let beauty = beauty(&albedo, &direct, &indirect, &emission);
-    // The shaded picture brings indirect, occlusion, bentnormal and A.
+    // The shaded picture brings indirect, occlusion, bentnormal and A, and the cameras of the G-buffer.
     let mut image = shaded;
-    image.world_to_camera = gbuffer.world_to_camera;
     image.add_rgb("", Precision::Half, &beauty);
     image.add_rgb("albedo", Precision::Half, &albedo);
     image.add_rgb("direct", Precision::Half, &direct);
@@ -63,6 +62,7 @@ mod tests {
             data_window: Window::of_size(1, 1),
             display_window: Window::of_size(1, 1),
             world_to_camera: None,
+            world_to_ndc: None,
             position: vec![[0.0; 3]],
             normal: vec![[0.0, 0.0, 1.0]],
             coverage: vec![1.0],

@@ -1,16 +1,17 @@
 //! What a daemon tells of itself and of scenes: `info`, `status`, `shutdown`.
 
-use super::args::{RunningArgs, ServerArgs};
+use super::args::{FormArgs, RunningArgs, ServerArgs};
 use super::failure::Failure;
 use super::files;
 use super::interrupt::Interrupt;
 use super::progress::Progress;
 use super::session;
-use super::summary::grouped;
+use super::summary::{at_address, grouped, pretty};
 use clap::Args;
 use pbgi_client::size::format_bytes;
 use pbgi_client::{Client, DaemonStatus, LevelShape, Pool, SceneShape};
 use pbgi_core::{PageKind, SceneInfo};
+use serde::Serialize;
 use std::path::PathBuf;
 
 /// `info`
@@ -19,6 +20,8 @@ pub(crate) struct InfoArgs {
     /// A scene made by build
     #[arg(value_name = "NAME.pbgi")]
     scene: PathBuf,
+    #[command(flatten)]
+    form: FormArgs,
     #[command(flatten)]
     server: ServerArgs,
 }
@@ -32,8 +35,20 @@ pub(crate) async fn info(args: InfoArgs, interrupt: &Interrupt) -> Result<(), Fa
         let asked = async { Ok((client.scene(&scene).await?, client.scene_shape(&scene).await?)) };
         interrupt.guard(asked).await?
     };
+    if args.form.json {
+        println!("{}", pretty(&Described { info, shape }));
+        return Ok(());
+    }
     print!("{}{}", describe(&info), histogram(&shape));
     Ok(())
+}
+
+/// What `info --json` prints.
+#[derive(Serialize)]
+struct Described {
+    #[serde(flatten)]
+    info: SceneInfo,
+    shape: SceneShape,
 }
 
 fn describe(info: &SceneInfo) -> String {
@@ -51,6 +66,7 @@ fn describe(info: &SceneInfo) -> String {
         ("points", grouped(info.point_count)),
         ("nodes", grouped(info.node_count)),
         ("bounds", bounds),
+        ("origin", info.origin.map(|axis| axis.to_string()).join(" ")),
         ("largest radius", info.radius_max.to_string()),
         ("node pages", pages(PageKind::Node)),
         ("point pages", pages(PageKind::Point)),
@@ -101,6 +117,8 @@ fn histogram(shape: &SceneShape) -> String {
 #[derive(Args, Debug)]
 pub(crate) struct StatusArgs {
     #[command(flatten)]
+    form: FormArgs,
+    #[command(flatten)]
     running: RunningArgs,
 }
 
@@ -113,7 +131,12 @@ pub(crate) async fn status(args: StatusArgs, interrupt: &Interrupt) -> Result<()
         }
         Ok(answers)
     });
-    for (client, status) in answers.await? {
+    let answers = answers.await?;
+    if args.form.json {
+        println!("{}", at_address(&answers));
+        return Ok(());
+    }
+    for (client, status) in answers {
         print!("{}", describe_daemon(&client, &status));
     }
     Ok(())
@@ -223,6 +246,7 @@ mod tests {
             bounds: None,
             quantizer: None,
             radius_max: 0.0,
+            origin: [0.0; 3],
             settings: BuildSettings::default(),
         };
         let text = describe(&info);

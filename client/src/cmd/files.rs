@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 /// Whether a path is one that a shared daemon understands, `ROOT:path`, and not a file here.
-fn in_a_root(path: &Path) -> bool {
+pub(crate) fn in_a_root(path: &Path) -> bool {
     let root = path
         .to_str()
         .and_then(|text| text.split_once(':'))

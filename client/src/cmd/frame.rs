@@ -3,7 +3,7 @@
 use super::args::{CameraArgs, Size};
 use super::failure::Failure;
 use pbgi_points::{Camera, GBuffer, MeshScene};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Rows of a picture whose size nobody asked for.
 const ROWS_DEFAULT: u32 = 540;
@@ -12,13 +12,23 @@ const ASPECT_DEFAULT: f32 = 16.0 / 9.0;
 /// Shapes that a camera may ask for; others are mistakes.
 const ASPECT_RANGE: std::ops::RangeInclusive<f32> = 0.1..=10.0;
 
-/// Renders the G-buffer of a mesh file; blocks.
-pub(crate) fn render(scene: &Path, args: CameraArgs) -> Result<GBuffer, Failure> {
+/// What is known of a picture before it is shaded.
+pub(crate) struct Frame {
+    pub(crate) gbuffer: GBuffer,
+    /// The light probe that the scene file names.
+    pub(crate) environment: Option<PathBuf>,
+}
+
+/// Renders the G-buffer of a mesh or scene file; blocks.
+pub(crate) fn render(scene: &Path, args: CameraArgs) -> Result<Frame, Failure> {
     let mesh = MeshScene::load(scene)?;
     let camera = mesh.camera(args.camera.unwrap_or(0));
     let camera = camera.map_err(|error| Failure::usage(format!("{error}: {}", scene.display())))?;
     let size = args.size.unwrap_or_else(|| size_for(&camera));
-    Ok(GBuffer::render(&mesh, &camera, size.width, size.height)?)
+    Ok(Frame {
+        gbuffer: GBuffer::render(&mesh, &camera, size.width, size.height)?,
+        environment: mesh.environment().map(Path::to_owned),
+    })
 }
 
 fn size_for(camera: &Camera) -> Size {

@@ -1,17 +1,23 @@
 //! `build`, `shade`, and what is done with jobs: `jobs`, `watch`, `cancel`.
 
 use super::args::{
-    CloudArgs, DensityArgs, JobArgs, OctreeArgs, OutputArgs, QualityArgs, RunningArgs, ServerArgs, StatsArgs,
+    CloudArgs, DensityArgs, FormArgs, JobArgs, OctreeArgs, OutputArgs, PassArgs, QualityArgs, RunningArgs, SeenArgs,
+    ServerArgs, StatsArgs,
 };
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
+use super::look::{Look, LookArgs};
 use super::progress::Progress;
+use super::render::temporary_folder;
 use super::session::{self, Work};
 use super::summary;
+use super::view::Seen;
 use clap::Args;
 use pbgi_client::{BuildJob, Job, JobState, ShadeJob};
-use std::path::PathBuf;
+use pbgi_points::LayeredImage;
+use std::f32::consts::FRAC_1_PI;
+use std::path::{Path, PathBuf};
 
 const BUILD_EXAMPLES: &str = "\
 Examples:
@@ -23,7 +29,7 @@ Examples:
 #[derive(Args, Debug)]
 #[command(after_help = BUILD_EXAMPLES)]
 pub(crate) struct BuildArgs {
-    /// Meshes (.glb, .gltf, .obj), sampled and lit by their lights; point clouds (.ply, .las, .laz, .ptc), of which those of
+    /// Meshes (.glb, .gltf, .obj, .ply with faces) and scene files (.toml), sampled and lit by their lights; point clouds (.ply, .las, .laz, .ptc), of which those of
     /// the LAS family are turned so that y is up; scenes (.pbgi) whose points are built again
     #[arg(required = true, value_name = "INPUT")]
     inputs: Vec<PathBuf>,
@@ -66,11 +72,13 @@ pub(crate) async fn build(args: BuildArgs, interrupt: &Interrupt) -> Result<(), 
 }
 
 const SHADE_EXAMPLES: &str = "\
-Example:
+Examples:
   pbgi-client shade hall.pbgi --gbuffer passes.exr -o indirect.exr --environment sky.hdr
+  pbgi-client shade hall.pbgi --gbuffer passes.exr --position Pcam --normal Ncam --space camera -o indirect.exr
+  pbgi-client shade town.pbgi --camera auto -o indirect.exr
 
-The G-buffer is an EXR file with world-space P and N. The output has the layers indirect (irradiance), occlusion (0 open,
-1 closed) and bentnormal; the root R, G, B equal indirect.";
+The G-buffer is an EXR file with P and N; without one, what a camera sees is found among the points. The output has the layers indirect (irradiance), occlusion (0 open, 1 closed) and
+bentnormal; the root R, G, B equal indirect. Cryptomatte layers and the header's attributes go into it as they are.";
 
 /// `shade`
 #[derive(Args, Debug)]
@@ -81,9 +89,15 @@ pub(crate) struct ShadeArgs {
     scene: PathBuf,
     /// World-space positions and normals of the pixels, an EXR file
     #[arg(long, value_name = "G.exr")]
-    gbuffer: PathBuf,
+    gbuffer: Option<PathBuf>,
+    #[command(flatten)]
+    passes: PassArgs,
+    #[command(flatten)]
+    look: LookArgs,
     #[command(flatten)]
     output: OutputArgs,
+    #[command(flatten)]
+    seen: SeenArgs,
     #[command(flatten)]
     quality: QualityArgs,
     #[command(flatten)]
@@ -96,15 +110,52 @@ pub(crate) struct ShadeArgs {
 
 pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), Failure> {
     let existing = Existing::from_flag(args.output.overwrite);
+    let look = args.look.check(existing)?;
+    let folder;
+    let gbuffer = match (&args.gbuffer, args.seen.is_given()) {
+        (Some(path), false) => files::input(path)?,
+        (None, true) if !args.job.detach => {
+            folder = temporary_folder()?;
+            folder.path().join("gbuffer.exr")
+        }
+        (None, true) => {
+            return Err(Failure::usage(
+                "--detach is for a G-buffer that is there: give --gbuffer",
+            ));
+        }
+        _ => {
+            return Err(Failure::usage(
+                "give either --gbuffer or a camera: --camera, --camera-file or --eye",
+            ));
+        }
+    };
     let job = ShadeJob {
         settings: args.quality.settings()?,
         scene: files::input(&args.scene)?,
-        gbuffer: files::input(&args.gbuffer)?,
+        gbuffer,
+        passes: args.passes.options(),
         output: files::output_of_kind(&args.output.output, existing, "exr")?,
         overwrite: existing.replaces(),
         environment: args.quality.environment.as_deref().map(files::input).transpose()?,
         workers: args.server.job_workers(),
     };
+    let output = job.output.clone();
+    if look.wanted() && (args.job.detach || files::in_a_root(&output)) {
+        return Err(Failure::usage(
+            "--png and --preview need the finished picture here: leave out --detach, and let -o name a file of this machine",
+        ));
+    }
+    if args.gbuffer.is_none() {
+        let seen = Seen {
+            scene: job.scene.clone(),
+            workers: job.workers,
+            settings: job.settings,
+        };
+        let mut progress = Progress::new();
+        let client = session::connect(&args.server, interrupt, &progress).await?;
+        let (gbuffer, _) = seen.gbuffer(&args.seen, &client, interrupt, &mut progress).await?;
+        gbuffer.write(&job.gbuffer)?;
+    }
     run(
         Work::Shade(job),
         &args.output,
@@ -113,7 +164,22 @@ pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), 
         &args.server,
         interrupt,
     )
-    .await
+    .await?;
+    if look.wanted() {
+        show_irradiance(&look, &output)?;
+    }
+    Ok(())
+}
+
+/// Shows irradiance as a white surface reflects it.
+fn show_irradiance(look: &Look, picture: &Path) -> Result<(), Failure> {
+    let image = LayeredImage::read_exr_channels(picture, |name| name.starts_with("indirect."))?;
+    let irradiance = image.triple("indirect").unwrap_or_default();
+    let radiance: Vec<[f32; 3]> = irradiance
+        .iter()
+        .map(|pixel| pixel.map(|value| value * FRAC_1_PI))
+        .collect();
+    look.show(image.data_window, &radiance)
 }
 
 async fn run(
@@ -148,13 +214,18 @@ pub(crate) struct ListArgs {
     #[arg(value_name = "JOB")]
     job: Option<String>,
     #[command(flatten)]
+    form: FormArgs,
+    #[command(flatten)]
     running: RunningArgs,
 }
 
 pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Failure> {
     if let Some(id) = &args.job {
         let (_, job) = interrupt.guard(session::find_job(&args.running, id)).await?;
-        print!("{}", in_full(&job));
+        match args.form.json {
+            true => println!("{}", summary::pretty(&job)),
+            false => print!("{}", in_full(&job)),
+        }
         return Ok(());
     }
     let jobs = interrupt.guard(async {
@@ -165,6 +236,10 @@ pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Fa
         Ok(jobs)
     });
     let jobs = jobs.await?;
+    if args.form.json {
+        println!("{}", summary::pretty(&jobs));
+        return Ok(());
+    }
     if jobs.is_empty() {
         eprintln!("no jobs yet");
     }

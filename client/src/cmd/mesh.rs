@@ -3,7 +3,7 @@
 use super::args::{CameraArgs, CloudArgs, DensityArgs, OutputArgs, StatsArgs};
 use super::failure::Failure;
 use super::files::{self, Existing};
-use super::frame;
+use super::frame::{self, Frame};
 use super::interrupt::Interrupt;
 use super::progress::Progress;
 use super::summary;
@@ -23,7 +23,7 @@ Points carry the radiance that leaves them: direct light reflected once, and emi
 #[derive(Args, Debug)]
 #[command(after_help = SAMPLE_EXAMPLES)]
 pub(crate) struct SampleArgs {
-    /// Meshes that light each other (.glb, .gltf, .obj), and clouds (.ply, .las, .laz, .ptc, .pbgi), which are converted
+    /// Meshes that light each other (.glb, .gltf, .obj, .ply with faces) and scene files (.toml), and clouds (.ply, .las, .laz, .ptc, .pbgi), which are converted
     #[arg(required = true, value_name = "SCENE")]
     inputs: Vec<PathBuf>,
     #[command(flatten)]
@@ -92,7 +92,7 @@ Writes P and N in world space, albedo, direct (irradiance of the punctual lights
 #[derive(Args, Debug)]
 #[command(after_help = GBUFFER_EXAMPLES)]
 pub(crate) struct GbufferArgs {
-    /// A mesh: .glb, .gltf, .obj
+    /// A mesh (.glb, .gltf, .obj, .ply with faces) or a scene file (.toml)
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     #[command(flatten)]
@@ -107,7 +107,7 @@ pub(crate) async fn gbuffer(args: GbufferArgs, interrupt: &Interrupt) -> Result<
     args.stats.check()?;
     let scene = files::input(&args.scene)?;
     let output = files::output_of_kind(&args.output.output, Existing::from_flag(args.output.overwrite), "exr")?;
-    let gbuffer = {
+    let Frame { gbuffer, .. } = {
         let mut progress = Progress::new();
         progress.stage("rendering the G-buffer");
         interrupt.blocking(move || frame::render(&scene, args.camera)).await?

@@ -4,18 +4,22 @@ mod args;
 mod cache;
 mod composite;
 mod daemon;
+mod diff;
 mod failure;
 mod files;
+mod filter;
 mod frame;
 mod generate;
 mod interrupt;
 mod jobs;
+mod look;
 mod mesh;
 mod progress;
 mod render;
 mod scenes;
 mod session;
 mod summary;
+mod view;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use failure::Failure;
@@ -34,7 +38,8 @@ Examples:
       The same in steps; the G-buffer may be another renderer's P and N passes.
 
 Nothing needs to be set up: a command that finds no daemon starts a private one, which leaves when it has been idle.
-Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted.";
+Exit codes: 0 done; 1 failed (diff: the pictures differ by more than the threshold); 2 wrong usage (diff: or no two pictures to
+compare); 130 interrupted.";
 
 /// Global illumination for scenes larger than memory: point clouds and meshes in, irradiance and occlusion out.
 #[derive(Debug, Parser)]
@@ -58,8 +63,14 @@ enum Command {
     Gbuffer(mesh::GbufferArgs),
     /// Build the octree of a scene from meshes or point clouds
     Build(jobs::BuildArgs),
-    /// Shade a G-buffer with a built scene
+    /// Shade a G-buffer, or what a camera sees, with a built scene
     Shade(jobs::ShadeArgs),
+    /// Show a built scene: its points in the light of the sky and of each other
+    View(view::ViewArgs),
+    /// Bake occlusion and irradiance onto the points of a cloud
+    Filter(filter::FilterArgs),
+    /// Compare two pictures layer by layer
+    Diff(diff::DiffArgs),
     /// Describe a built scene
     Info(daemon::InfoArgs),
     /// Show the daemon: memory, workers, open scenes
@@ -130,6 +141,9 @@ async fn dispatch(command: Command, interrupt: &Interrupt) -> Result<(), Failure
         Command::Gbuffer(args) => mesh::gbuffer(args, interrupt).await,
         Command::Build(args) => jobs::build(args, interrupt).await,
         Command::Shade(args) => jobs::shade(args, interrupt).await,
+        Command::View(args) => view::view(args, interrupt).await,
+        Command::Filter(args) => filter::filter(args, interrupt).await,
+        Command::Diff(args) => diff::diff(args, interrupt).await,
         Command::Info(args) => daemon::info(args, interrupt).await,
         Command::Status(args) => daemon::status(args, interrupt).await,
         Command::Cache(args) => cache::cache(args, interrupt).await,
@@ -166,8 +180,8 @@ mod tests {
     fn every_command_of_the_contract_is_there() {
         let command = Arguments::command();
         for name in [
-            "demo", "render", "sample", "generate", "gbuffer", "build", "shade", "info", "status", "jobs", "watch",
-            "cancel", "pause", "resume", "retry", "shutdown",
+            "demo", "render", "sample", "generate", "gbuffer", "build", "shade", "view", "filter", "diff", "info",
+            "status", "jobs", "watch", "cancel", "pause", "resume", "retry", "shutdown",
         ] {
             assert!(command.find_subcommand(name).is_some(), "{name}");
         }

@@ -97,7 +97,7 @@ impl Drop for Progress {
 
 fn restyle(bar: &ProgressBar, stage: &str, total: u64) {
     let template = if total > 0 {
-        "{spinner} {msg:12} {wide_bar} {percent:>3} %  {eta:>4}"
+        "{spinner} {msg:12} {wide_bar} {percent:>3} %  {per_sec:>12}  {eta:>4}"
     } else {
         "{spinner} {msg}  {elapsed}"
     };

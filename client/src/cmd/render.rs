@@ -4,8 +4,9 @@ use super::args::{CameraArgs, DensityArgs, OutputArgs, QualityArgs, ServerArgs, 
 use super::composite::composite;
 use super::failure::Failure;
 use super::files::{self, Existing};
-use super::frame;
+use super::frame::{self, Frame};
 use super::interrupt::Interrupt;
+use super::look::{ExposureArgs, Look, LookArgs};
 use super::progress::Progress;
 use super::scenes::{self, SceneCache};
 use super::session::{self, Work};
@@ -13,7 +14,7 @@ use super::summary;
 use clap::Args;
 use pbgi_client::{BuildJob, Client, ShadeJob};
 use pbgi_core::{BuildSettings, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Density, GBuffer, LayeredImage, SampleOptions, ToneMap, demo, write_png};
+use pbgi_points::{CloudOptions, Density, GBuffer, GBufferOptions, LayeredImage, SampleOptions, Space, demo};
 use std::path::{Path, PathBuf};
 
 const RENDER_EXAMPLES: &str = "\
@@ -28,14 +29,13 @@ The built scene stays in XDG_CACHE_HOME/pbgi/scenes, keyed by the mesh and its s
 #[derive(Args, Debug)]
 #[command(after_help = RENDER_EXAMPLES)]
 pub(crate) struct RenderArgs {
-    /// A mesh with lights: .glb, .gltf, .obj
+    /// A mesh with lights (.glb, .gltf, .obj, .ply with faces) or a scene file (.toml)
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     #[command(flatten)]
     output: OutputArgs,
-    /// Also write a tone-mapped picture to look at
-    #[arg(long, value_name = "FILE.png")]
-    png: Option<PathBuf>,
+    #[command(flatten)]
+    look: LookArgs,
     #[command(flatten)]
     camera: CameraArgs,
     #[command(flatten)]
@@ -61,6 +61,8 @@ pub(crate) struct DemoArgs {
     #[arg(long, value_name = "WxH", value_parser = super::args::picture_size)]
     size: Option<Size>,
     #[command(flatten)]
+    exposure: ExposureArgs,
+    #[command(flatten)]
     density: DensityArgs,
     #[command(flatten)]
     quality: QualityArgs,
@@ -82,7 +84,7 @@ const DEMO_POINTS: u64 = 200_000;
 struct Plan {
     input: PathBuf,
     output: PathBuf,
-    png: Option<PathBuf>,
+    look: Look,
     camera: CameraArgs,
     density: Density,
     settings: ShadeSettings,
@@ -91,15 +93,12 @@ struct Plan {
 
 pub(crate) async fn render(args: RenderArgs, interrupt: &Interrupt) -> Result<(), Failure> {
     let existing = Existing::from_flag(args.output.overwrite);
-    let png = args.png.as_deref();
     args.stats.check()?;
     let plan = Plan {
         settings: args.quality.settings()?,
         input: files::input(&args.scene)?,
         output: files::output_of_kind(&args.output.output, existing, "exr")?,
-        png: png
-            .map(|path| files::output_of_kind(path, existing, "png"))
-            .transpose()?,
+        look: args.look.check(existing)?,
         camera: args.camera,
         density: args.density.density().unwrap_or(SampleOptions::default().density),
         environment: args.quality.environment.as_deref().map(files::input).transpose()?,
@@ -117,7 +116,9 @@ pub(crate) async fn demo(args: DemoArgs, interrupt: &Interrupt) -> Result<(), Fa
         settings: args.quality.settings()?,
         input: folder.path().join("demo.glb"),
         output: files::output_of_kind(output, existing, "exr")?,
-        png: Some(files::output(&output.with_extension("png"), existing)?),
+        look: args
+            .exposure
+            .look(Some(files::output(&output.with_extension("png"), existing)?)),
         camera: CameraArgs {
             camera: None,
             size: Some(args.size.unwrap_or(DEMO_SIZE)),
@@ -136,7 +137,7 @@ async fn picture(plan: &Plan, server: &ServerArgs, stats: &StatsArgs, interrupt:
         let mut progress = Progress::new();
         progress.stage("rendering the G-buffer");
         let (input, camera) = (plan.input.clone(), plan.camera);
-        let gbuffer = interrupt.blocking(move || frame::render(&input, camera)).await?;
+        let Frame { gbuffer, environment } = interrupt.blocking(move || frame::render(&input, camera)).await?;
         let passes = folder.path().join("gbuffer.exr");
         gbuffer.write(&passes)?;
         let client = session::connect(server, interrupt, &progress).await?;
@@ -145,10 +146,15 @@ async fn picture(plan: &Plan, server: &ServerArgs, stats: &StatsArgs, interrupt:
         let job = ShadeJob {
             scene,
             gbuffer: passes,
+            // Our own passes need no second look.
+            passes: GBufferOptions {
+                space: Space::World,
+                ..GBufferOptions::default()
+            },
             output: shaded.clone(),
             overwrite: false,
             settings: plan.settings,
-            environment: plan.environment.clone(),
+            environment: plan.environment.clone().or(environment),
             workers: server.job_workers(),
         };
         let shading = session::run(&client, &Work::Shade(job), interrupt, &mut progress).await?;
@@ -196,7 +202,7 @@ async fn scene(
 }
 
 /// One command, one record: bytes of both jobs, the higher peak, everything else from whichever job knows it.
-fn add(statistics: &mut Statistics, shading: &Statistics) {
+pub(crate) fn add(statistics: &mut Statistics, shading: &Statistics) {
     let build = statistics.clone();
     statistics.update(shading);
     let sum = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(|a, b| a + b);
@@ -210,16 +216,10 @@ fn write(plan: &Plan, gbuffer: &GBuffer, shaded: &Path, statistics: &Statistics)
     let image = composite(gbuffer, LayeredImage::read_exr(shaded)?, statistics)?;
     image.write_exr(&plan.output)?;
     eprintln!("wrote {}", plan.output.display());
-    if let Some(path) = &plan.png {
-        let beauty = image.triple("").unwrap_or_default();
-        let window = image.data_window;
-        write_png(path, window.width, window.height, &beauty, ToneMap::Filmic)?;
-        eprintln!("wrote {}", path.display());
-    }
-    Ok(())
+    plan.look.show(image.data_window, &image.triple("").unwrap_or_default())
 }
 
-fn temporary_folder() -> Result<tempfile::TempDir, Failure> {
+pub(crate) fn temporary_folder() -> Result<tempfile::TempDir, Failure> {
     let folder = tempfile::Builder::new().prefix("pbgi-render-").tempdir();
     folder.map_err(|error| {
         Failure::failed(format!(

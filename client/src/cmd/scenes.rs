@@ -94,8 +94,14 @@ pub(crate) fn digest(input: &Path, density: Density) -> Result<String, Failure> 
     digest.text(env!("CARGO_PKG_VERSION"));
     digest.text(&format!("{density:?}"));
     let mut paths = vec![input.to_owned()];
-    let folder = input.parent().unwrap_or(Path::new("/"));
-    paths.extend(named_files(input).into_iter().map(|name| folder.join(name)));
+    if extension(input) == "toml" {
+        paths.extend(pbgi_points::scene_meshes(input)?);
+    }
+    for index in 0..paths.len() {
+        let folder = paths[index].parent().unwrap_or(Path::new("/")).to_owned();
+        let named = named_files(&paths[index]).into_iter();
+        paths.extend(named.map(|name| folder.join(name)));
+    }
     for (index, path) in paths.iter().enumerate() {
         match File::open(path) {
             Ok(file) => digest.file(file).map_err(|error| fault("read", path, &error))?,
@@ -109,18 +115,18 @@ pub(crate) fn digest(input: &Path, density: Density) -> Result<String, Failure> 
 
 /// Files that a mesh file names, relative to its folder.
 fn named_files(input: &Path) -> BTreeSet<String> {
-    let extension = input
-        .extension()
-        .unwrap_or_default()
-        .to_string_lossy()
-        .to_ascii_lowercase();
-    let found = match extension.as_str() {
+    let found = match extension(input).as_str() {
         "gltf" => File::open(input).ok().and_then(|file| gltf_uris(file.take(JSON_MAX))),
         "glb" => File::open(input).ok().and_then(|file| gltf_uris(glb_json(file)?)),
         "obj" => Some(obj_files(input)),
         _ => None,
     };
     found.unwrap_or_default()
+}
+
+fn extension(path: &Path) -> String {
+    let extension = path.extension().unwrap_or_default();
+    extension.to_string_lossy().to_ascii_lowercase()
 }
 
 fn glb_json(mut file: File) -> Option<impl Read> {

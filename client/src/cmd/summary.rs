@@ -3,13 +3,10 @@
 use super::failure::Failure;
 use super::files;
 use pbgi_client::size::scaled_bytes;
+use pbgi_client::{Client, serialize_statistics};
 use pbgi_core::Statistics;
-use pbgi_core::statistics::{Row, Unit};
-use serde::Serializer;
+use pbgi_core::statistics::Unit;
 use std::path::Path;
-
-/// Largest integer that a JSON number holds exactly.
-const EXACT_MAX: f64 = 9_007_199_254_740_992.0;
 
 /// Prints the table, and writes the file if one is asked for.
 pub(crate) fn report(statistics: &Statistics, file: Option<&Path>) -> Result<(), Failure> {
@@ -38,25 +35,33 @@ pub(crate) fn table(statistics: &Statistics) -> String {
 
 /// Every row by name, in the table's order; `null` where it does not apply.
 pub(crate) fn json(statistics: &Statistics) -> String {
-    let rows = statistics.rows();
     let mut bytes = Vec::new();
     let mut serializer = serde_json::Serializer::pretty(&mut bytes);
     // A vector takes every byte, and names and numbers are always JSON.
-    let written = serializer.collect_map(rows.iter().map(|row| (row.name, number(row))));
+    let written = serialize_statistics(statistics, &mut serializer);
     debug_assert!(written.is_ok());
     bytes.push(b'\n');
     String::from_utf8_lossy(&bytes).into_owned()
 }
 
-/// Counts are written without a fraction; what is not a number does not apply.
-fn number(row: &Row) -> serde_json::Value {
-    match row.value {
-        Some(value) if value.fract() == 0.0 && (0.0..=EXACT_MAX).contains(&value) => {
-            serde_json::Value::from(value as u64)
-        }
-        Some(value) => serde_json::Value::from(value),
-        None => serde_json::Value::Null,
+/// JSON for people and programs. What commands print are plain records: they have no map keys and numbers that JSON lacks.
+pub(crate) fn pretty(value: &impl serde::Serialize) -> String {
+    serde_json::to_string_pretty(value).unwrap_or_default()
+}
+
+/// JSON of what daemons answered, each with its address.
+pub(crate) fn at_address<T: serde::Serialize>(answers: &[(Client, T)]) -> String {
+    #[derive(serde::Serialize)]
+    struct Answer<'a, T> {
+        address: &'a str,
+        #[serde(flatten)]
+        answer: &'a T,
     }
+    let answers = answers.iter().map(|(client, answer)| Answer {
+        address: client.address(),
+        answer,
+    });
+    pretty(&answers.collect::<Vec<_>>())
 }
 
 fn figure(unit: Unit, value: f64) -> (String, &'static str) {

@@ -210,6 +210,7 @@ impl Job<'_> {
             bounds: quantizer.map(|_| tally.bounds),
             quantizer,
             radius_max: tally.radius_max,
+            origin: self.intake.origin,
             settings,
         }
     }

@@ -136,6 +136,8 @@ pub(crate) struct Intake {
     pub(crate) tally: Tally,
     /// `None` if there are no points.
     pub(crate) quantizer: Option<Quantizer>,
+    /// See [`PointStream::origin`].
+    pub(crate) origin: [f64; 3],
     /// Reading and sorting so far.
     pub(crate) seconds: StageSeconds,
 }
@@ -177,6 +179,7 @@ pub(crate) fn take_in<S: PointStream + ?Sized>(
     }
     Ok(Intake {
         quantizer: pass.quantizer.or_else(|| lattice(&pass.tally.bounds)),
+        origin: stream.origin(),
         tally: pass.tally,
         seconds: pass.seconds,
     })

@@ -27,6 +27,8 @@ pub struct SceneInfo {
     pub quantizer: Option<Quantizer>,
     /// Largest point radius, world units.
     pub radius_max: f32,
+    /// What was subtracted from the coordinates of the files, in their own axes, to make positions.
+    pub origin: [f64; 3],
     /// Layout and construction settings.
     pub settings: BuildSettings,
 }

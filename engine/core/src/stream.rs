@@ -15,6 +15,11 @@ pub trait PointStream {
     /// Number of points, where known without reading them; an estimate is welcome, it only serves progress.
     fn len_hint(&self) -> Option<u64>;
 
+    /// What was subtracted from the coordinates of the files, in their own axes, to make positions.
+    fn origin(&self) -> [f64; 3] {
+        [0.0; 3]
+    }
+
     /// Appends the next batch (some thousands of points) to `batch`; `false` when there was none left.
     ///
     /// # Errors

@@ -87,6 +87,9 @@ pub enum PointsError {
         /// Bytes there are for it.
         available: u64,
     },
+    /// What is wrong with a scene file, each with file, line and remedy.
+    #[error("{}", .0.join("\n"))]
+    Scene(Vec<String>),
     /// The caller stopped it.
     #[error("cancelled")]
     Cancelled,

@@ -22,14 +22,18 @@ pub const INPUT_MEMORY_DEFAULT: u64 = 2 << 30;
 /// Least memory that brings a cloud into order: two blocks at work, and the counts of coarse cells.
 pub const ESTIMATE_MEMORY_MIN: u64 = 8_000_000;
 
-/// Most channels of an EXR file.
-pub const EXR_CHANNELS_MAX: usize = 64;
+/// Most channels of an EXR file: passes, light groups and Cryptomatte ranks of a film's frame are 100 to 300. Only those that
+/// are read take memory.
+pub const EXR_CHANNELS_MAX: usize = 1024;
 
 /// Most parts of an EXR file whose headers are looked at.
 pub const EXR_PARTS_MAX: usize = 64;
 
 /// Edge of the tiles of EXR files that we write, pixels: the tiles of the work queue.
 pub const EXR_TILE_EDGE: usize = pbgi_core::limits::TILE_EDGE as usize;
+
+/// Most bytes of a scene file: hundreds of thousands of placed meshes.
+pub const SCENE_FILE_BYTES_MAX: u64 = 64 << 20;
 
 /// Most bytes of a PLY header.
 pub const PLY_HEADER_BYTES_MAX: u64 = 1 << 16;
@@ -76,7 +80,7 @@ pub const TEXTURE_EDGE_MAX: u32 = 1 << 15;
 /// Most bytes that decoding one texture may take.
 pub const TEXTURE_BYTES_MAX: u64 = 1 << 30;
 
-/// Most bytes of the decoded pixels of an EXR file, all channels together.
+/// Most bytes of the pixels that are read from an EXR file, all channels together.
 pub const EXR_BYTES_MAX: u64 = 4 << 30;
 
 /// Most bytes of one tile or block of scanlines of an EXR file, decoded.

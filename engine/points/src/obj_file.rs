@@ -1,11 +1,12 @@
-//! Wavefront OBJ: faces, `Kd` and `map_Kd`, `Ke`, dissolve below one half as a hole. No lights and no cameras.
+//! Wavefront OBJ: faces, `Kd` and `map_Kd`, `Ke` and `map_Ke`, dissolve (`d`, or 1 - `Tr`) below one half as a hole. No lights and
+//! no cameras.
 
 use crate::error::PointsError;
 use crate::material::{Material, Texture, TextureSlot, Wrap};
 use crate::named_file::beside;
 use crate::scene::{Geometry, Instance, SceneParts};
 use crate::texture_file::decode;
-use glam::DAffine3;
+use glam::{Affine2, DAffine3, Vec2};
 use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::io::BufReader;
@@ -91,17 +92,18 @@ fn read_material(
     textures: &mut Vec<Texture>,
     known: &mut BTreeMap<String, usize>,
 ) -> Result<Material, PointsError> {
-    let albedo_texture = match &material.diffuse_texture {
-        Some(name) => Some(TextureSlot {
-            texture: texture(path, name, textures, known)?,
-            uv_set: 0,
-            transform: None,
-            wrap: [Wrap::Repeat; 2],
-        }),
-        None => None,
-    };
+    let mut slot = |map: Option<&String>| map.map(|map| slot(path, map, textures, known)).transpose();
+    let albedo_texture = slot(material.diffuse_texture.as_ref())?;
+    let emission_texture = slot(material.unknown_param.get("map_Ke"))?;
     let diffuse = material.diffuse.unwrap_or(GREY);
-    let emission = material.emissive.unwrap_or_default();
+    let emission = match material.emissive {
+        None if emission_texture.is_some() => [1.0; 3],
+        emission => emission.unwrap_or_default(),
+    };
+    let see_through = material
+        .unknown_param
+        .get("Tr")
+        .and_then(|text| text.parse::<f32>().ok());
     if !diffuse
         .iter()
         .chain(&emission)
@@ -117,12 +119,87 @@ fn read_material(
         } else {
             diffuse
         },
-        alpha: material.dissolve.unwrap_or(1.0),
+        alpha: material.dissolve.unwrap_or(1.0 - see_through.unwrap_or(0.0)),
         albedo_texture,
         emission,
-        emission_texture: None,
+        emission_texture,
         cutoff: Some(0.5),
         double_sided: true,
+    })
+}
+
+/// What stands behind `map_Kd`: options, then the name of a picture.
+#[derive(Debug, PartialEq)]
+struct Map<'a> {
+    name: &'a str,
+    scale: Vec2,
+    offset: Vec2,
+    clamped: bool,
+}
+
+impl<'a> Map<'a> {
+    /// `None` without a name.
+    fn parse(text: &'a str) -> Option<Self> {
+        let mut map = Self {
+            name: text.trim(),
+            scale: Vec2::ONE,
+            offset: Vec2::ZERO,
+            clamped: false,
+        };
+        while let Some((option, rest)) = split_word(map.name).filter(|(word, _)| word.starts_with('-')) {
+            // Vectors may lack their last numbers; the rest have as many words as they have.
+            let vector = matches!(option, "-s" | "-o" | "-t");
+            let most = if vector {
+                3
+            } else if option == "-mm" {
+                2
+            } else {
+                1
+            };
+            let mut words = Vec::new();
+            map.name = rest;
+            while let Some((word, rest)) = split_word(map.name).filter(|_| words.len() < most) {
+                if vector && word.parse::<f32>().is_err() {
+                    break;
+                }
+                words.push(word);
+                map.name = rest;
+            }
+            let number = |index: usize, missing: f32| words.get(index).map_or(Some(missing), |word| word.parse().ok());
+            match option {
+                "-s" => map.scale = Vec2::new(number(0, 1.0)?, number(1, 1.0)?),
+                "-o" => map.offset = Vec2::new(number(0, 0.0)?, number(1, 0.0)?),
+                "-clamp" => map.clamped = words == ["on"],
+                _ => {}
+            }
+        }
+        (!map.name.is_empty()).then_some(map)
+    }
+}
+
+fn split_word(text: &str) -> Option<(&str, &str)> {
+    let text = text.trim();
+    (!text.is_empty())
+        .then(|| text.split_once(char::is_whitespace).unwrap_or((text, "")))
+        .map(|(word, rest)| (word, rest.trim()))
+}
+
+fn slot(
+    path: &Path,
+    text: &str,
+    textures: &mut Vec<Texture>,
+    known: &mut BTreeMap<String, usize>,
+) -> Result<TextureSlot, PointsError> {
+    let map = Map::parse(text).filter(|map| map.scale.is_finite() && map.offset.is_finite());
+    let map = map.ok_or_else(|| PointsError::invalid(path, format!("a material's map is not understood: {text:?}")))?;
+    // The file's v points up, ours down.
+    let offset = Vec2::new(map.offset.x, 1.0 - map.scale.y - map.offset.y);
+    let moved = map.scale != Vec2::ONE || map.offset != Vec2::ZERO;
+    Ok(TextureSlot {
+        texture: texture(path, map.name, textures, known)?,
+        uv_set: 0,
+        transform: moved.then(|| Affine2::from_translation(offset) * Affine2::from_scale(map.scale)),
+        wrap: [if map.clamped { Wrap::Clamp } else { Wrap::Repeat }; 2],
     })
 }
 
@@ -135,9 +212,8 @@ fn texture(
     if let Some(&index) = known.get(name) {
         return Ok(index);
     }
-    // Options before the name, and Windows' separators.
-    let last = name.trim().replace('\\', "/");
-    let file = beside(path, &last)?;
+    // Windows' separators.
+    let file = beside(path, &name.replace('\\', "/"))?;
     let bytes = std::fs::read(&file).map_err(|error| {
         let what = format!("texture {file:?} is named but cannot be read ({error}): copy it beside the scene");
         PointsError::invalid(path, what)
@@ -145,4 +221,31 @@ fn texture(
     textures.push(decode(&file, &bytes)?);
     known.insert(name.to_owned(), textures.len() - 1);
     Ok(textures.len() - 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_stand_before_the_name_of_a_map() {
+        let map = |name, scale, offset, clamped| {
+            Some(Map {
+                name,
+                scale,
+                offset,
+                clamped,
+            })
+        };
+        let plain = |name| map(name, Vec2::ONE, Vec2::ZERO, false);
+        assert_eq!(Map::parse(" wood grain.png "), plain("wood grain.png"));
+        assert_eq!(Map::parse("-bm 0.5 -mm 0 1 wood.png"), plain("wood.png"));
+        assert_eq!(Map::parse("-t 0.1 0.1 wood.png"), plain("wood.png"));
+        assert_eq!(
+            Map::parse("-s 2 3 1 -o 0.5 maps\\wood.png"),
+            map("maps\\wood.png", Vec2::new(2.0, 3.0), Vec2::new(0.5, 0.0), false)
+        );
+        assert_eq!(Map::parse("-clamp on 1.png"), map("1.png", Vec2::ONE, Vec2::ZERO, true));
+        assert_eq!(Map::parse("-s 2 2 2"), None);
+    }
 }

@@ -7,7 +7,7 @@ use crate::cloud::{Cloud, CloudOptions, Missing, Radius};
 use crate::error::PointsError;
 use crate::estimate::{Estimated, Means};
 use crate::limits;
-use crate::ply::PlyPoints;
+use crate::ply::{self, PlyPoints};
 use crate::sample::MeshPoints;
 use crate::scene::MeshScene;
 use pbgi_core::{Bounds, PointRecord, PointStream};
@@ -106,7 +106,7 @@ enum Source {
 
 /// Kinds of files, told by their names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+pub(crate) enum Kind {
     Mesh,
     Ply,
     Las,
@@ -114,7 +114,7 @@ enum Kind {
     Scene,
 }
 
-/// Opens files as one stream of points. Mesh files (`.gltf`, `.glb`, `.obj`) are put into one scene, so that each is lit
+/// Opens files as one stream of points. Mesh files (`.gltf`, `.glb`, `.obj`, `.ply` with faces, scene files `.toml`) are put into one scene, so that each is lit
 /// by the lights and shadowed by the surfaces of all; they come first, then the clouds (`.ply`, `.las`, `.laz`, `.ptc`, and
 /// the points of built scenes, `.pbgi`) in the order given, those last whose normals or radii are estimated: they come in
 /// Z-order, all files that lack the same together.
@@ -148,14 +148,10 @@ pub fn open_input(paths: &[PathBuf], options: &InputOptions) -> Result<Input, Po
     }
     let mut lacking: BTreeMap<(Missing, bool), Vec<Box<dyn Cloud>>> = BTreeMap::new();
     for (kind, path) in kinds {
-        let (origin, cloud) = (input.origin, &options.cloud);
-        let cloud: Box<dyn Cloud> = match kind {
-            Kind::Mesh => continue,
-            Kind::Ply => Box::new(PlyPoints::open(path, origin, cloud)?),
-            Kind::Las => Box::new(LasPoints::open(path, origin, cloud)?),
-            Kind::Ptc => Box::new(PtcPoints::open(path, origin, cloud)?),
-            Kind::Scene => Box::new(ScenePoints::open(path, origin, cloud)?),
-        };
+        if kind == Kind::Mesh {
+            continue;
+        }
+        let cloud = open_cloud(path, input.origin, &options.cloud)?;
         let missing = cloud.missing();
         check_missing(path, missing, &options.cloud)?;
         match options.cloud.radius {
@@ -180,6 +176,17 @@ pub fn open_input(paths: &[PathBuf], options: &InputOptions) -> Result<Input, Po
         input.streams.push(Source::Estimated(Box::new(estimated)));
     }
     Ok(input)
+}
+
+/// Opens one cloud; positions are relative to `origin`.
+pub(crate) fn open_cloud(path: &Path, origin: [f64; 3], options: &CloudOptions) -> Result<Box<dyn Cloud>, PointsError> {
+    Ok(match kind(path)? {
+        Kind::Mesh => return Err(PointsError::unsupported(path, "a mesh as a cloud", "sample it first")),
+        Kind::Ply => Box::new(PlyPoints::open(path, origin, options)?),
+        Kind::Las => Box::new(LasPoints::open(path, origin, options)?),
+        Kind::Ptc => Box::new(PtcPoints::open(path, origin, options)?),
+        Kind::Scene => Box::new(ScenePoints::open(path, origin, options)?),
+    })
 }
 
 /// What [`open_input`] will subtract from the positions of clouds, read from headers.
@@ -209,9 +216,10 @@ fn of_kind<'a>(kinds: &[(Kind, &'a Path)], wanted: Kind) -> Vec<&'a Path> {
     chosen.map(|(_, path)| *path).collect()
 }
 
-fn kind(path: &Path) -> Result<Kind, PointsError> {
+pub(crate) fn kind(path: &Path) -> Result<Kind, PointsError> {
     Ok(match extension(path).as_str() {
-        "gltf" | "glb" | "obj" => Kind::Mesh,
+        "gltf" | "glb" | "obj" | "toml" => Kind::Mesh,
+        "ply" if ply::mesh::has_faces(path)? => Kind::Mesh,
         "ply" => Kind::Ply,
         "las" | "laz" => Kind::Las,
         "ptc" => Kind::Ptc,
@@ -221,7 +229,7 @@ fn kind(path: &Path) -> Result<Kind, PointsError> {
             return Err(PointsError::unsupported(
                 path,
                 what,
-                "convert it to .glb, .gltf, .obj, .ply, .las, .laz or .ptc",
+                "convert it to .glb, .gltf, .obj, .ply, .las, .laz or .ptc, or describe it in a scene file, .toml",
             ));
         }
     })
@@ -254,11 +262,6 @@ pub(crate) fn extension(path: &Path) -> String {
 }
 
 impl Input {
-    /// Subtracted from the positions of clouds, in their files' axes.
-    pub fn origin(&self) -> [f64; 3] {
-        self.origin
-    }
-
     /// Bytes that the input keeps while it is read, at most.
     pub fn memory_bytes(&self) -> u64 {
         let kept = |source: &Source| match source {
@@ -311,6 +314,20 @@ impl PointStream for Input {
 
     fn len_hint(&self) -> Option<u64> {
         self.streams.iter().map(|source| source.stream().len_hint()).sum()
+    }
+
+    fn origin(&self) -> [f64; 3] {
+        if self.origin != [0.0; 3] {
+            return self.origin;
+        }
+        // Scenes whose points were moved once, and are not moved again.
+        let mut origins = self.streams.iter().map(|source| source.stream().origin());
+        let first = origins.next().unwrap_or_default();
+        if origins.all(|origin| origin == first) {
+            first
+        } else {
+            [0.0; 3]
+        }
     }
 
     fn next_batch(&mut self, batch: &mut Vec<PointRecord>) -> Result<bool, PointsError> {

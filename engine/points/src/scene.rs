@@ -6,10 +6,10 @@ use crate::error::PointsError;
 use crate::light::Light;
 use crate::material::{Material, Texture};
 use crate::trace::Tracer;
-use crate::{gltf_file, limits, obj_file};
+use crate::{gltf_file, limits, obj_file, ply, scene_file};
 use glam::{DAffine3, DVec3, Vec2, Vec3};
 use pbgi_core::Bounds;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Triangles with materials and textures, lights and cameras, ready to be sampled and traced. A mesh that is placed many
 /// times is kept once.
@@ -20,6 +20,7 @@ pub struct MeshScene {
     pub(crate) textures: Vec<Texture>,
     lights: Vec<Light>,
     cameras: Vec<Camera>,
+    environment: Option<PathBuf>,
     bounds: Bounds,
     area: f64,
     tracer: Tracer,
@@ -77,10 +78,13 @@ pub(crate) struct SceneParts {
     pub(crate) textures: Vec<Texture>,
     pub(crate) lights: Vec<Light>,
     pub(crate) cameras: Vec<Camera>,
+    /// The light probe that a scene file names.
+    pub(crate) environment: Option<PathBuf>,
 }
 
 impl MeshScene {
-    /// Reads a mesh file: `.gltf`, `.glb` or `.obj`, with the buffers and textures it names.
+    /// Reads a mesh file, `.gltf`, `.glb`, `.obj` or `.ply`, with the buffers and textures it names, or a scene file, `.toml`,
+    /// with all the mesh files it names.
     ///
     /// # Errors
     /// No or a damaged file, a missing buffer or texture, an unsupported feature, no triangles, a vertex that is not finite.
@@ -112,22 +116,16 @@ impl MeshScene {
         };
         for path in paths {
             let before = all.memory_bytes();
-            // What is not there is reported by its reader.
-            let length = std::fs::metadata(path).map_or(0, |metadata| metadata.len());
-            fits(before.saturating_add(length))?;
             let parts = match crate::open::extension(path).as_str() {
-                "gltf" | "glb" => gltf_file::read(path, &|bytes| fits(before.saturating_add(bytes)))?,
-                "obj" => obj_file::read(path)?,
-                other => {
-                    let what = format!("a mesh of kind {other:?}");
-                    return Err(PointsError::unsupported(
-                        path,
-                        what,
-                        "convert it to .glb, .gltf or .obj",
-                    ));
+                "toml" => {
+                    let beside =
+                        |mesh: &Path, parts: &SceneParts| read_mesh(mesh, before + parts.memory_bytes(), &fits);
+                    let parts = scene_file::read(path, &beside)?;
+                    parts.check(path)?;
+                    parts
                 }
+                _ => read_mesh(path, before, &fits)?,
             };
-            parts.check(path)?;
             all.append(parts);
             fits(all.memory_bytes())?;
         }
@@ -158,6 +156,7 @@ impl MeshScene {
             textures: parts.textures,
             lights: parts.lights,
             cameras: parts.cameras,
+            environment: parts.environment,
             bounds,
             area,
             tracer,
@@ -196,6 +195,11 @@ impl MeshScene {
     /// The cameras, in the file's order.
     pub fn cameras(&self) -> &[Camera] {
         &self.cameras
+    }
+
+    /// The light probe that a scene file names.
+    pub fn environment(&self) -> Option<&Path> {
+        self.environment.as_deref()
     }
 
     /// Camera number `index`; the first of a file without cameras is one that sees everything ([`Camera::framing`]).
@@ -268,6 +272,29 @@ impl MeshScene {
     }
 }
 
+/// Reads and checks one mesh file; `fits` says whether so many bytes are to be had, of which `before` are taken.
+fn read_mesh(
+    path: &Path,
+    before: u64,
+    fits: &dyn Fn(u64) -> Result<(), PointsError>,
+) -> Result<SceneParts, PointsError> {
+    // What is not there is reported by its reader.
+    let length = std::fs::metadata(path).map_or(0, |metadata| metadata.len());
+    fits(before.saturating_add(length))?;
+    let parts = match crate::open::extension(path).as_str() {
+        "gltf" | "glb" => gltf_file::read(path, &|bytes| fits(before.saturating_add(bytes)))?,
+        "obj" => obj_file::read(path)?,
+        "ply" => ply::mesh::read(path)?,
+        other => {
+            let what = format!("a mesh of kind {other:?}");
+            let remedy = "convert it to .glb, .gltf, .obj or a .ply with faces";
+            return Err(PointsError::unsupported(path, what, remedy));
+        }
+    };
+    parts.check(path)?;
+    Ok(parts)
+}
+
 /// Bytes of a scene at its peak, while its charts and BVHs are made.
 fn memory_bytes(geometries: &[Geometry], instances: &[Instance], textures: &[Texture]) -> u64 {
     let bytes = |geometry: &Geometry| {
@@ -286,7 +313,7 @@ impl SceneParts {
         memory_bytes(&self.geometries, &self.instances, &self.textures)
     }
 
-    fn append(&mut self, mut other: Self) {
+    pub(crate) fn append(&mut self, mut other: Self) {
         let (geometries, materials, textures) = (self.geometries.len(), self.materials.len(), self.textures.len());
         for geometry in &mut other.geometries {
             geometry
@@ -307,6 +334,7 @@ impl SceneParts {
         self.textures.append(&mut other.textures);
         self.lights.append(&mut other.lights);
         self.cameras.append(&mut other.cameras);
+        self.environment = self.environment.take().or(other.environment);
     }
 
     /// What no later code looks at again: there are triangles, and every placed vertex is a finite f32.

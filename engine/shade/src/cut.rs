@@ -212,7 +212,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
 
 /// What a page says must fit where it was found: pages are checksummed, but a file may be forged.
 #[inline(always)]
-fn check(node: &NodeRecord, visit: &Visit, leaf_max: u32) -> Result<(), SourceError> {
+pub(crate) fn check(node: &NodeRecord, visit: &Visit, leaf_max: u32) -> Result<(), SourceError> {
     let fits = match node.kind() {
         NodeKind::Inner { mask, .. } => mask != 0 && visit.level < MORTON_BITS,
         NodeKind::Leaf { count, .. } => count != 0 && count <= leaf_max,
@@ -230,7 +230,7 @@ fn check(node: &NodeRecord, visit: &Visit, leaf_max: u32) -> Result<(), SourceEr
 
 /// Pushes the children for receivers to whom octant `near` is the nearest, so that it is popped first.
 #[inline(always)]
-fn push_children(
+pub(crate) fn push_children(
     stack: &mut Vec<Visit>,
     visit: &Visit,
     node: &NodeRecord,
@@ -262,7 +262,7 @@ fn push_children(
 
 /// Reads a leaf's points.
 #[inline(always)]
-fn read_points<S: SceneSource>(
+pub(crate) fn read_points<S: SceneSource>(
     source: &mut S,
     first: PointIndex,
     count: u32,

@@ -38,12 +38,18 @@ struct Manifest {
     #[serde(skip_serializing_if = "Option::is_none")]
     root: Option<NodeIndex>,
     radius_max: f32,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    origin: [f64; 3],
     settings: BuildSettings,
     pages: Pages,
     #[serde(skip_serializing_if = "Option::is_none")]
     bounds: Option<Bounds>,
     #[serde(skip_serializing_if = "Option::is_none")]
     quantizer: Option<Quantizer>,
+}
+
+fn is_zero(origin: &[f64; 3]) -> bool {
+    *origin == [0.0; 3]
 }
 
 /// For people: what follows from the counts and settings. Checked all the same.
@@ -82,6 +88,7 @@ pub fn encode(info: &SceneInfo, path: &Path) -> Result<String, StoreError> {
         node_slots: info.node_slots,
         root: info.root,
         radius_max: info.radius_max,
+        origin: info.origin,
         settings: info.settings,
         pages: Pages::of(info),
         bounds: info.bounds,
@@ -133,6 +140,7 @@ pub fn decode(text: &str, path: &Path) -> Result<SceneInfo, StoreError> {
         bounds: manifest.bounds,
         quantizer: manifest.quantizer,
         radius_max: manifest.radius_max,
+        origin: manifest.origin,
         settings: manifest.settings,
     };
     check(&info, path)?;
@@ -208,6 +216,9 @@ fn check(info: &SceneInfo, path: &Path) -> Result<(), StoreError> {
             "a finite cube where there are points",
             format!("{:?}", info.quantizer),
         );
+    }
+    if !info.origin.iter().all(|axis| axis.is_finite()) {
+        return refuse("origin", "three finite numbers", format!("{:?}", info.origin));
     }
     if !info.radius_max.is_finite() || info.radius_max < 0.0 || (info.radius_max > 0.0) != filled {
         return refuse(

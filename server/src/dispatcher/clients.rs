@@ -95,7 +95,7 @@ impl Dispatcher {
     pub async fn submit(self: &Arc<Self>, submission: Submission) -> Result<JobStatus, JobError> {
         check_job_id(&submission.id)?;
         submission.options.validate()?;
-        submission.request.validate(&self.roots)?;
+        submission.request.validate(&self.roots())?;
         let (job, status) = {
             let mut state = self.lock();
             match state.find_same(&submission)? {
@@ -103,17 +103,24 @@ impl Dispatcher {
                 None => self.take(&mut state, submission)?,
             }
         };
-        let stored = self.table.ticket().await;
-        if let Err(reason) = stored.unwrap_or_else(|_| Err("the job table was closed".to_owned())) {
+        if let Err(error) = self.stored().await {
             let mut state = self.lock();
-            let event = Event::Fail {
-                job,
-                reason: reason.clone(),
-            };
-            self.dispatch(&mut state, event, None);
-            return Err(JobError::new(JobErrorKind::Unavailable, reason));
+            let reason = error.text.clone();
+            self.dispatch(&mut state, Event::Fail { job, reason }, None);
+            return Err(error);
         }
         Ok(status)
+    }
+
+    /// Returns when everything that was changed so far will survive the daemon.
+    ///
+    /// # Errors
+    /// A disk that does not take it.
+    pub async fn stored(&self) -> Result<(), JobError> {
+        let stored = self.table.ticket().await;
+        stored
+            .unwrap_or_else(|_| Err("the job table was closed".to_owned()))
+            .map_err(|reason| JobError::new(JobErrorKind::Unavailable, reason))
     }
 
     fn take(self: &Arc<Self>, state: &mut State, submission: Submission) -> Result<(JobNo, JobStatus), JobError> {
@@ -356,7 +363,7 @@ impl Dispatcher {
     /// # Errors
     /// It is none, or damaged.
     pub async fn scene(self: &Arc<Self>, path: PathBuf) -> Result<SceneInfo, JobError> {
-        self.roots.check("scene", &path, Want::Read)?;
+        self.roots().check("scene", &path, Want::Read)?;
         let this = self.clone();
         let opened = tokio::task::spawn_blocking(move || this.open_scene(&path)).await;
         let opened = opened.map_err(|error| JobError::new(JobErrorKind::Internal, error.to_string()))?;
@@ -377,7 +384,7 @@ impl Dispatcher {
     /// # Errors
     /// It is none, or damaged, or may not be read.
     pub(crate) fn open_scene(&self, path: &Path) -> Result<Mounted, JobError> {
-        let place = self.roots.read(path)?;
+        let place = self.roots().read(path)?;
         self.mounts.open(&place.path).map_err(|error| JobError {
             text: place.hide(&error.text),
             ..error
@@ -389,7 +396,7 @@ impl Dispatcher {
     /// # Errors
     /// It is none, or may not be read.
     pub(crate) fn read_environment(&self, path: &Path) -> Result<Arc<Environment>, JobError> {
-        let place = self.roots.read(path)?;
+        let place = self.roots().read(path)?;
         let environment = pbgi_points::read_environment(&place.path).map_err(|error| {
             let text = place.hide(&error.to_string());
             JobError::new(JobErrorKind::Precondition, text)
@@ -402,8 +409,8 @@ impl Dispatcher {
     /// # Errors
     /// A job uses it.
     pub(crate) fn drop_scene(&self, path: &Path) -> Result<bool, JobError> {
-        self.roots.check("scene", path, Want::Read)?;
-        let place = self.roots.read(path)?;
+        self.roots().check("scene", path, Want::Read)?;
+        let place = self.roots().read(path)?;
         self.mounts.close(&place.path)
     }
 

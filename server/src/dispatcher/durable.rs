@@ -58,6 +58,7 @@ impl Dispatcher {
         state.totals.tiles += 1;
         state.totals.counters.add(counters);
         if let Some(live) = state.lives.get_mut(&job) {
+            state.scenes.entry(live.mounted.id()).or_default().add(counters);
             live.tiles.remove(&tile);
             live.counters.add(counters);
             // It has room for every tile; a client that left does not listen.
@@ -66,6 +67,7 @@ impl Dispatcher {
         }
         let Some(record) = state.jobs.get_mut(&job) else { return };
         if let Some(shading) = &mut record.shading {
+            state.scenes.entry(shading.mounted.id()).or_default().add(counters);
             shading.frame.fill(tile, &values);
             shading.counters.add(counters);
         }

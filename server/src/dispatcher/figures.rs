@@ -4,7 +4,9 @@ use super::{Dispatcher, Record};
 use crate::framebuffer::Preview;
 use crate::job::{JobState, JobStatus, Request};
 use crate::memory::anonymous_bytes;
+use crate::mounts::MountStatus;
 use crate::shade_job::{Counters, shading_statistics};
+use pbgi_cache::SceneCounters;
 use pbgi_core::Statistics;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -40,7 +42,34 @@ pub struct JobFigures {
     pub statistics: Statistics,
 }
 
+/// A mounted scene with its figures since it was mounted.
+#[derive(Clone, Debug)]
+pub struct SceneFigures {
+    /// The scene.
+    pub mount: MountStatus,
+    /// Of its nodes and of its points.
+    pub cache: [SceneCounters; 2],
+    /// What its tiles took.
+    pub counters: Counters,
+}
+
 impl Dispatcher {
+    /// Mounted scenes.
+    pub fn scene_figures(&self) -> Vec<SceneFigures> {
+        let mounts = self.mounts.list();
+        let mut state = self.lock();
+        // A scene that is mounted again has another id.
+        state.scenes.retain(|id, _| mounts.iter().any(|mount| mount.id == *id));
+        let figures = |mount: MountStatus| {
+            Some(SceneFigures {
+                cache: self.cache.scene_counters(mount.id)?,
+                counters: state.scenes.get(&mount.id).copied().unwrap_or_default(),
+                mount,
+            })
+        };
+        mounts.into_iter().filter_map(figures).collect()
+    }
+
     /// Sums since the start.
     pub fn totals(&self) -> Totals {
         let (mut totals, pids) = {

@@ -4,10 +4,11 @@ use super::Dispatcher;
 use crate::error::{JobError, JobErrorKind};
 use crate::framebuffer::TileReceivers;
 use crate::limits;
-use crate::live::{Live, LiveResult, LiveTask};
+use crate::live::{Live, LiveResult, LiveTask, RECEIVER_BYTES};
 use crate::roots::Want;
 use crate::scheduler::{DRAINING, Event, JobNo, Kind, Order};
-use crate::shade_job::Counters;
+use crate::shade_job::{Counters, tile_statistics};
+use pbgi_core::Statistics;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
@@ -22,9 +23,18 @@ impl Dispatcher {
         task.settings
             .validate()
             .map_err(|error| JobError::invalid(error.to_string()))?;
-        self.roots.check("scene", &task.scene, Want::Read)?;
+        if task.priority.abs() > limits::PRIORITY_MAX {
+            let (priority, max) = (task.priority, limits::PRIORITY_MAX);
+            let text = format!("priority is {priority}, must be from -{max} to {max}");
+            return Err(JobError::invalid(text));
+        }
+        if let Some(angle) = task.pixel_angle.filter(|&angle| !(angle > 0.0 && angle < 1.0)) {
+            let text = format!("pixel_angle is {angle}, must be above 0 and below 1");
+            return Err(JobError::invalid(text));
+        }
+        self.roots().check("scene", &task.scene, Want::Read)?;
         if let Some(path) = &task.environment {
-            self.roots.check("environment", path, Want::Read)?;
+            self.roots().check("environment", path, Want::Read)?;
         }
         let (this, paths) = (self.clone(), task.clone());
         let opened = tokio::task::spawn_blocking(move || {
@@ -51,14 +61,17 @@ impl Dispatcher {
             mounted,
             settings: task.settings,
             environment,
+            pixel_angle: task.pixel_angle,
             tiles: BTreeMap::new(),
             counters: Counters::default(),
+            receivers: 0,
+            started: Instant::now(),
+            peaks: (0, 0),
             results,
         };
         state.lives.insert(job, live);
         let order = Order {
-            // Somebody sits and waits.
-            priority: limits::PRIORITY_MAX,
+            priority: task.priority,
             user: super::durable::user_number(&task.user),
             ..Order::default()
         };
@@ -70,9 +83,26 @@ impl Dispatcher {
     pub fn feed(self: &Arc<Self>, job: JobNo, tile: u32, receivers: TileReceivers) {
         let mut state = self.lock();
         if let Some(live) = state.lives.get_mut(&job) {
+            live.receivers += (receivers.bytes.len() / RECEIVER_BYTES) as u64;
             live.tiles.insert(tile, receivers);
             self.dispatch(&mut state, Event::Feed { job, tile }, None);
         }
+    }
+
+    /// What a session took so far.
+    pub fn live_statistics(&self, job: JobNo) -> Option<Statistics> {
+        self.sample_memory();
+        let pages = self.cache.job_counters(job.0);
+        let state = self.lock();
+        let live = state.lives.get(&job)?;
+        let info = live.mounted.scene().info();
+        let seconds = live.started.elapsed().as_secs_f64();
+        Some(Statistics {
+            holes: Some((live.receivers - live.counters.receivers.min(live.receivers)) as f64),
+            peak_memory_bytes: Some(live.peaks.0 as f64),
+            cache_peak_bytes: Some(live.peaks.1 as f64),
+            ..tile_statistics(info, &live.counters, &pages, seconds)
+        })
     }
 
     /// Ends a session: what is not done is let go.

@@ -45,7 +45,11 @@ impl Dispatcher {
         let private: u64 = pids.into_iter().filter_map(anonymous_bytes).sum();
         let memory = private + self.cache.layout().total_bytes();
         let cache = self.cache.counters().resident_bytes;
-        for record in self.lock().jobs.values_mut() {
+        let mut state = self.lock();
+        for live in state.lives.values_mut() {
+            live.peaks = (live.peaks.0.max(memory), live.peaks.1.max(cache));
+        }
+        for record in state.jobs.values_mut() {
             if record.status.borrow().state == JobState::Running {
                 record.memory_peak_bytes = record.memory_peak_bytes.max(memory);
                 record.cache_peak_bytes = record.cache_peak_bytes.max(cache);

@@ -2,10 +2,10 @@
 
 use crate::dispatcher::{DaemonStatus, TaskInfo};
 use crate::error::JobError;
-use crate::job::{BuildTask, Density, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
+use crate::job::{BuildTask, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
 use crate::shade_job::Counters;
 use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
-use pbgi_points::{CloudOptions, Facing, InvalidPoints, Radius, ViewDensity};
+use pbgi_points::{CloudOptions, Density, Facing, GBufferOptions, InvalidPoints, Radius, Space, ViewDensity};
 use pbgi_proto::v1;
 use pbgi_store::{LevelShape, SceneShape};
 
@@ -16,21 +16,11 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
             output: task.output.into(),
             overwrite: task.overwrite,
             settings: build_settings(task.settings),
-            density: match task.density {
-                None => Density::Default,
-                Some(v1::build_task::Density::Spacing(spacing)) => Density::Spacing(spacing),
-                Some(v1::build_task::Density::Points(points)) => Density::Points(points),
-                Some(v1::build_task::Density::View(view)) => Density::View(ViewDensity {
-                    camera: view.camera as usize,
-                    size: [view.width, view.height],
-                    pixels: view.pixels,
-                    floor: view.floor,
-                    ceiling: view.ceiling,
-                }),
-            },
+            density: task.density.map(density),
             cloud: cloud(task.cloud.unwrap_or_default())?,
         })),
         Some(v1::submit_job_request::Task::Shade(task)) => Ok(Request::Shade(ShadeTask {
+            passes: passes(&task)?,
             scene: task.scene.into(),
             gbuffer: task.gbuffer.into(),
             output: task.output.into(),
@@ -40,6 +30,20 @@ pub(super) fn request(task: Option<v1::submit_job_request::Task>) -> Result<Requ
             workers: (task.workers > 0).then_some(task.workers as usize),
         })),
         None => Err(JobError::invalid("the request has no task")),
+    }
+}
+
+fn density(density: v1::build_task::Density) -> Density {
+    match density {
+        v1::build_task::Density::Spacing(spacing) => Density::Spacing(spacing),
+        v1::build_task::Density::Points(points) => Density::Points(points),
+        v1::build_task::Density::View(view) => Density::View(ViewDensity {
+            camera: view.camera as usize,
+            size: [view.width, view.height],
+            pixels: view.pixels,
+            floor: view.floor,
+            ceiling: view.ceiling,
+        }),
     }
 }
 
@@ -56,6 +60,20 @@ pub(super) fn options(options: Option<v1::JobOptions>, caller: &str) -> JobOptio
         after: given.after,
         paused: given.paused,
     }
+}
+
+fn passes(task: &v1::ShadeTask) -> Result<GBufferOptions, JobError> {
+    let layer = |name: &String| (!name.is_empty()).then(|| name.clone());
+    Ok(GBufferOptions {
+        position: layer(&task.position),
+        normal: layer(&task.normal),
+        space: match v1::Space::try_from(task.space) {
+            Ok(v1::Space::Checked) => Space::Checked,
+            Ok(v1::Space::World) => Space::World,
+            Ok(v1::Space::Camera) => Space::Camera,
+            Err(unknown) => return Err(JobError::invalid(format!("space is {unknown}"))),
+        },
+    })
 }
 
 fn cloud(given: v1::CloudSettings) -> Result<CloudOptions, JobError> {
@@ -144,7 +162,7 @@ pub(super) fn job(status: JobStatus) -> v1::Job {
     }
 }
 
-fn statistics(statistics: &Statistics) -> v1::Statistics {
+pub(super) fn statistics(statistics: &Statistics) -> v1::Statistics {
     let rows = statistics.rows().into_iter();
     v1::Statistics {
         rows: rows.filter_map(|row| Some((row.name.to_owned(), row.value?))).collect(),
@@ -180,6 +198,7 @@ pub(super) fn scene(info: &SceneInfo) -> v1::SceneInfo {
             vec![x, y, z, quantizer.edge]
         }),
         radius_max: info.radius_max,
+        origin: info.origin.to_vec(),
         settings: Some(v1::BuildSettings {
             leaf_max: Some(info.settings.leaf_max),
             chunk_levels: Some(info.settings.chunk_levels),
@@ -210,6 +229,7 @@ pub(super) fn task(task: &TaskInfo) -> v1::Task {
         environment_width: task.environment.as_ref().map_or(0, |environment| environment.width()),
         environment_height: task.environment.as_ref().map_or(0, |environment| environment.height()),
         environment: pixels.flat_map(|value| value.to_le_bytes()).collect(),
+        rays: task.pixel_angle.map(|pixel_angle| v1::RayTracing { pixel_angle }),
     }
 }
 

@@ -1,14 +1,20 @@
-//! Who may call: by the user at the other end of a Unix socket, by certificate and token over TCP.
+//! Who may call what: by the user at the other end of a Unix socket, by certificate and token over TCP.
 
 use super::status::status;
-use crate::access::{Access, Auth};
+use crate::access::{Access, Auth, Call, Token};
 use crate::error::{JobError, JobErrorKind, ServerError};
+use std::collections::BTreeSet;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
+use tonic::Status;
+use tonic::body::Body;
+use tonic::codegen::http::{Extensions, Request, Response};
 use tonic::transport::server::{TcpConnectInfo, TlsConnectInfo, UdsConnectInfo};
-use tonic::{Extensions, Request, Status};
+use tower::{Layer, Service};
 
 /// Characters that a token has at least.
 const TOKEN_CHARS_MIN: usize = 32;
@@ -26,13 +32,18 @@ pub(super) enum Caller {
 
 impl Caller {
     /// From what the transport says about a connection.
-    pub(super) fn of(extensions: &Extensions) -> Self {
-        if let Some(info) = extensions.get::<UdsConnectInfo>() {
+    pub(super) fn of(extensions: &tonic::Extensions) -> Self {
+        Self::behind(
+            extensions.get::<UdsConnectInfo>(),
+            extensions.get::<TlsConnectInfo<TcpConnectInfo>>(),
+        )
+    }
+
+    fn behind(user: Option<&UdsConnectInfo>, remote: Option<&TlsConnectInfo<TcpConnectInfo>>) -> Self {
+        if let Some(info) = user {
             return Self::User(info.peer_cred.map(|peer| peer.uid()));
         }
-        let certificates = extensions
-            .get::<TlsConnectInfo<TcpConnectInfo>>()
-            .and_then(TlsConnectInfo::peer_certs);
+        let certificates = remote.and_then(TlsConnectInfo::peer_certs);
         match certificates.as_ref().and_then(|chain| chain.first()) {
             Some(certificate) => Self::Certificate(crc32c::crc32c(certificate)),
             None => Self::Anybody,
@@ -52,85 +63,207 @@ impl Caller {
     }
 }
 
-/// The rules of one listener.
-#[derive(Clone, Debug)]
-pub(super) struct Gate(Arc<Rules>);
+/// What a caller may do; found with each request that was let in.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Grants(Arc<BTreeSet<Call>>);
 
-#[derive(Debug)]
+impl Grants {
+    fn all() -> Self {
+        Self(Arc::new(Call::ALL.into()))
+    }
+
+    /// Refuses what the caller of a request may not do.
+    pub(super) fn ask(extensions: &tonic::Extensions, call: Call) -> Result<(), Status> {
+        let granted = extensions.get::<Self>().is_some_and(|grants| grants.0.contains(&call));
+        if granted { Ok(()) } else { Err(not_granted(call)) }
+    }
+}
+
+fn not_granted(call: Call) -> Status {
+    let text = format!("this token does not allow to {}", call.name());
+    status(JobError::new(JobErrorKind::Denied, text))
+}
+
+/// Which sort of call a method is. What is not known here takes the most.
+fn sort(path: &str) -> Call {
+    // Health and reflection.
+    if path.starts_with("/grpc.") {
+        return Call::Look;
+    }
+    match path.strip_prefix("/pbgi.v1.").unwrap_or_default() {
+        "JobService/GetJob"
+        | "JobService/ListJobs"
+        | "JobService/WatchJob"
+        | "SceneService/GetScene"
+        | "SceneService/GetSceneShape"
+        | "DaemonService/GetStatus"
+        | "DaemonService/GetCache" => Call::Look,
+        "JobService/SubmitJob"
+        | "JobService/CancelJob"
+        | "JobService/PauseJob"
+        | "JobService/ResumeJob"
+        | "JobService/RetryJob"
+        | "SceneService/WarmScene"
+        | "ShadeService/ShadePoints" => Call::Work,
+        _ => Call::Operate,
+    }
+}
+
+/// The rules of one listener, which may change while it is served; clones share them.
+#[derive(Clone, Debug)]
+pub struct Gate(Arc<RwLock<Rules>>);
+
+#[derive(Debug, PartialEq, Eq)]
 struct Rules {
     uids: Vec<u32>,
     certificates: bool,
     anybody: bool,
-    token: Option<String>,
+    /// Tokens and what they allow; without any, whoever is let in may do everything.
+    tokens: Vec<(String, Grants)>,
 }
 
 impl Gate {
+    fn new(rules: Rules) -> Self {
+        Self(Arc::new(RwLock::new(rules)))
+    }
+
     /// For our own user only.
-    pub(super) fn own() -> Self {
-        Self(Arc::new(Rules {
-            uids: vec![nix::unistd::geteuid().as_raw()],
-            certificates: false,
-            anybody: false,
-            token: None,
-        }))
+    pub fn own() -> Self {
+        Self::users(&Access::default())
     }
 
     /// For our own user and those that the configuration allows.
-    pub(super) fn users(access: &Access) -> Self {
+    pub fn users(access: &Access) -> Self {
         let others = access.users.iter().map(|uid| uid.as_raw());
-        Self(Arc::new(Rules {
+        Self::new(Rules {
             uids: others.chain([nix::unistd::geteuid().as_raw()]).collect(),
             certificates: false,
             anybody: false,
-            token: None,
-        }))
+            tokens: Vec::new(),
+        })
     }
 
     /// For callers over TCP.
     ///
     /// # Errors
     /// A token file that cannot be read, is too short, or can be read by others.
-    pub(super) fn remote(auth: &Auth) -> Result<Self, ServerError> {
-        let (certificates, anybody, token) = match auth {
-            Auth::DangerouslyInsecure => (false, true, None),
-            Auth::MutualTls { token, .. } => (true, false, token.as_deref().map(read_token).transpose()?),
+    pub fn remote(auth: &Auth) -> Result<Self, ServerError> {
+        let (certificates, tokens) = match auth {
+            Auth::DangerouslyInsecure => (false, Vec::new()),
+            Auth::MutualTls { tokens, .. } => {
+                let read = |token: &Token| Ok((read_token(&token.file)?, Grants(Arc::new(token.calls.clone()))));
+                (true, tokens.iter().map(read).collect::<Result<_, ServerError>>()?)
+            }
         };
-        Ok(Self(Arc::new(Rules {
+        Ok(Self::new(Rules {
             uids: Vec::new(),
             certificates,
-            anybody,
-            token,
-        })))
+            anybody: !certificates,
+            tokens,
+        }))
     }
 
-    fn admits(&self, caller: Caller, token: Option<&str>) -> bool {
-        let known = match caller {
-            Caller::User(uid) => uid.is_some_and(|uid| self.0.uids.contains(&uid)),
-            Caller::Certificate(_) => self.0.certificates,
-            Caller::Anybody => self.0.anybody,
+    /// Takes over the rules of another gate; whether they are others.
+    pub fn change(&self, other: &Self) -> bool {
+        let mut rules = Rules {
+            uids: Vec::new(),
+            certificates: false,
+            anybody: false,
+            tokens: Vec::new(),
         };
-        known
-            && self
-                .0
-                .token
-                .as_deref()
-                .is_none_or(|wanted| token.is_some_and(|token| same(token, wanted)))
+        std::mem::swap(&mut rules, &mut other.0.write().unwrap_or_else(PoisonError::into_inner));
+        let mut own = self.0.write().unwrap_or_else(PoisonError::into_inner);
+        let changed = *own != rules;
+        *own = rules;
+        changed
+    }
+
+    /// What a caller may do; `None` for one that is not known.
+    fn admits(&self, caller: Caller, token: Option<&str>) -> Option<Grants> {
+        let rules = self.0.read().unwrap_or_else(PoisonError::into_inner);
+        let known = match caller {
+            Caller::User(uid) => uid.is_some_and(|uid| rules.uids.contains(&uid)),
+            Caller::Certificate(_) => rules.certificates,
+            Caller::Anybody => rules.anybody,
+        };
+        if !known {
+            return None;
+        }
+        if rules.tokens.is_empty() {
+            return Some(Grants::all());
+        }
+        let given = token.unwrap_or_default();
+        // All are compared, so that the time does not tell which it is.
+        rules.tokens.iter().fold(None, |found, (wanted, grants)| {
+            if same(given, wanted) {
+                Some(grants.clone())
+            } else {
+                found
+            }
+        })
     }
 
     /// Lets a request in or not.
-    pub(super) fn check(&self, request: Request<()>) -> Result<Request<()>, Status> {
-        let caller = Caller::of(request.extensions());
+    fn check<B>(&self, request: &mut Request<B>) -> Result<(), Status> {
+        let extensions: &Extensions = request.extensions();
+        let caller = Caller::behind(
+            extensions.get::<UdsConnectInfo>(),
+            extensions.get::<TlsConnectInfo<TcpConnectInfo>>(),
+        );
         let header = request
-            .metadata()
+            .headers()
             .get("authorization")
             .and_then(|value| value.to_str().ok());
         let token = header.and_then(|header| header.strip_prefix("Bearer "));
-        if self.admits(caller, token) {
-            return Ok(request);
+        let Some(grants) = self.admits(caller, token) else {
+            complain(caller);
+            let text = "this caller is not known here: another user, certificate or token is needed";
+            return Err(status(JobError::new(JobErrorKind::Unauthenticated, text)));
+        };
+        let call = sort(request.uri().path());
+        if !grants.0.contains(&call) {
+            return Err(not_granted(call));
         }
-        complain(caller);
-        let text = "this caller is not known here: another user, certificate or token is needed";
-        Err(status(JobError::new(JobErrorKind::Unauthenticated, text)))
+        request.extensions_mut().insert(grants);
+        Ok(())
+    }
+}
+
+impl<S> Layer<S> for Gate {
+    type Service = Guarded<S>;
+
+    fn layer(&self, inner: S) -> Guarded<S> {
+        let gate = self.clone();
+        Guarded { gate, inner }
+    }
+}
+
+/// A service behind a gate.
+#[derive(Clone, Debug)]
+pub struct Guarded<S> {
+    gate: Gate,
+    inner: S,
+}
+
+impl<S, B> Service<Request<B>> for Guarded<S>
+where
+    S: Service<Request<B>, Response = Response<Body>>,
+    S::Future: Send + 'static,
+    S::Error: Send + 'static,
+{
+    type Response = S::Response;
+    type Error = S::Error;
+    type Future = Pin<Box<dyn Future<Output = Result<S::Response, S::Error>> + Send>>;
+
+    fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
+        self.inner.poll_ready(cx)
+    }
+
+    fn call(&mut self, mut request: Request<B>) -> Self::Future {
+        match self.gate.check(&mut request) {
+            Ok(()) => Box::pin(self.inner.call(request)),
+            Err(status) => Box::pin(std::future::ready(Ok(status.into_http()))),
+        }
     }
 }
 
@@ -203,14 +336,18 @@ mod tests {
         let token = "0123456789abcdef0123456789abcdef";
         std::fs::write(&file, format!("{token}\n")).unwrap();
         std::fs::set_permissions(&file, PermissionsExt::from_mode(0o600)).unwrap();
-        let tls = |token| Auth::MutualTls {
+        let tls = |tokens| Auth::MutualTls {
             cert: "/c".into(),
             key: "/k".into(),
             client_ca: "/a".into(),
-            token,
+            tokens,
         };
-        let signed = Gate::remote(&tls(Some(file.clone()))).unwrap();
-        let plain_tls = Gate::remote(&tls(None)).unwrap();
+        let look = Token {
+            file: file.clone(),
+            calls: [Call::Look].into(),
+        };
+        let signed = Gate::remote(&tls(vec![look.clone()])).unwrap();
+        let plain_tls = Gate::remote(&tls(Vec::new())).unwrap();
         let certificate = Caller::Certificate(1);
         let wrong = "0123456789abcdef0123456789abcdeF";
         let matrix = [
@@ -225,18 +362,49 @@ mod tests {
             (plain_tls, Caller::Anybody, None, false),
             (signed.clone(), certificate, Some(token), true),
             (signed.clone(), certificate, Some(wrong), false),
-            (signed, certificate, None, false),
+            (signed.clone(), certificate, None, false),
         ];
         for (index, (gate, caller, token, admitted)) in matrix.iter().enumerate() {
-            assert_eq!(gate.admits(*caller, *token), *admitted, "case {index}: {caller:?}");
+            assert_eq!(
+                gate.admits(*caller, *token).is_some(),
+                *admitted,
+                "case {index}: {caller:?}"
+            );
         }
+        assert_eq!(
+            signed.admits(certificate, Some(token)).unwrap().0,
+            look.calls.clone().into()
+        );
+        // Taken over by a gate that is in use.
+        assert!(signed.change(&Gate::remote(&tls(Vec::new())).unwrap()));
+        assert_eq!(signed.admits(certificate, None), Some(Grants::all()));
+        assert!(!signed.change(&Gate::remote(&tls(Vec::new())).unwrap()));
         println!(
             "RELIABILITY R11: {} of {} callers judged rightly",
             matrix.len(),
             matrix.len()
         );
         std::fs::set_permissions(&file, PermissionsExt::from_mode(0o644)).unwrap();
-        let error = Gate::remote(&tls(Some(file))).unwrap_err().to_string();
+        let error = Gate::remote(&tls(vec![look])).unwrap_err().to_string();
         assert!(error.contains("644"), "{error}");
+    }
+
+    #[test]
+    fn every_method_is_of_the_sort_that_it_should_be() {
+        let text =
+            std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../proto/pbgi/v1/jobs.proto")).unwrap();
+        let mut service = "";
+        let mut methods = Vec::new();
+        for line in text.lines().map(str::trim) {
+            if let Some(rest) = line.strip_prefix("service ") {
+                service = rest.split(' ').next().unwrap();
+            } else if let Some(rest) = line.strip_prefix("rpc ") {
+                methods.push(format!("/pbgi.v1.{service}/{}", rest.split('(').next().unwrap()));
+            }
+        }
+        let of = |call: Call| methods.iter().filter(|method| sort(method) == call).count();
+        assert_eq!((of(Call::Look), of(Call::Work), of(Call::Operate)), (7, 7, 2));
+        assert_eq!(sort("/grpc.health.v1.Health/Check"), Call::Look);
+        assert_eq!(sort("/pbgi.v1.JobService/EraseJobs"), Call::Operate);
     }
 }

@@ -1,8 +1,9 @@
 //! What clients may ask: jobs, scenes, the daemon.
 
-use super::gate::Caller;
+use super::gate::{Caller, Grants};
 use super::status::status;
 use super::{cache, convert};
+use crate::access::Call;
 use crate::dispatcher::{Dispatcher, Submission};
 use crate::error::{JobError, JobErrorKind};
 use crate::job::JobStatus;
@@ -29,6 +30,12 @@ pub(super) struct Jobs {
 impl Jobs {
     pub(super) fn new(dispatcher: Arc<Dispatcher>) -> Self {
         Self { dispatcher }
+    }
+
+    /// Answers with a job that somebody changed, once the change is on the disk.
+    async fn changed(&self, job: JobStatus) -> Result<Response<v1::Job>, Status> {
+        self.dispatcher.stored().await.map_err(status)?;
+        Ok(Response::new(convert::job(job)))
     }
 }
 
@@ -65,6 +72,9 @@ impl JobService for Jobs {
     }
 
     async fn watch_job(&self, request: Request<v1::WatchJobRequest>) -> Result<Response<Self::WatchJobStream>, Status> {
+        if request.get_ref().cancel_on_disconnect {
+            Grants::ask(request.extensions(), Call::Work)?;
+        }
         let request = request.into_inner();
         let job = self.dispatcher.watch(&request.job_id).map_err(status)?;
         let (sender, receiver) = mpsc::channel(1);
@@ -85,7 +95,7 @@ impl JobService for Jobs {
             .dispatcher
             .cancel(&request.job_id, &request.reason)
             .map_err(status)?;
-        Ok(Response::new(convert::job(job)))
+        self.changed(job).await
     }
 
     async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Result<Response<v1::Job>, Status> {
@@ -94,17 +104,17 @@ impl JobService for Jobs {
             .dispatcher
             .pause(&request.job_id, &request.reason)
             .map_err(status)?;
-        Ok(Response::new(convert::job(job)))
+        self.changed(job).await
     }
 
     async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> Result<Response<v1::Job>, Status> {
         let job = self.dispatcher.resume(&request.into_inner().job_id).map_err(status)?;
-        Ok(Response::new(convert::job(job)))
+        self.changed(job).await
     }
 
     async fn retry_job(&self, request: Request<v1::RetryJobRequest>) -> Result<Response<v1::Job>, Status> {
         let job = self.dispatcher.retry(&request.into_inner().job_id).map_err(status)?;
-        Ok(Response::new(convert::job(job)))
+        self.changed(job).await
     }
 }
 

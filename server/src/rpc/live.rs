@@ -57,6 +57,8 @@ impl ShadeService for LiveShading {
             settings: convert::shade_settings(start.settings),
             environment: (!start.environment.is_empty()).then(|| start.environment.into()),
             user,
+            priority: start.priority.unwrap_or(limits::PRIORITY_MAX),
+            pixel_angle: start.rays.map(|rays| rays.pixel_angle),
         };
         let (job, values) = self.dispatcher.open_live(task).await.map_err(status)?;
         let (answers, stream) = mpsc::channel(ANSWERS_MAX);
@@ -69,6 +71,11 @@ impl ShadeService for LiveShading {
             done: BTreeMap::new(),
             tile_next: 0,
             answer_next: 0,
+            tiles_max: match start.workers {
+                0 => limits::LIVE_TILES_MAX,
+                workers => (workers as usize).min(limits::LIVE_TILES_MAX),
+            },
+            reports: start.report,
         };
         tokio::spawn(session.run(requests, receivers));
         Ok(Response::new(ReceiverStream::new(stream)))
@@ -86,6 +93,9 @@ struct Session {
     done: BTreeMap<u32, Vec<u8>>,
     tile_next: u32,
     answer_next: u32,
+    /// Tiles out at once: no more workers than this can have one.
+    tiles_max: usize,
+    reports: bool,
 }
 
 impl Drop for Session {
@@ -115,7 +125,7 @@ impl Session {
             self.hand_out();
             let out = self.tile_next - self.answer_next;
             if !more && out == 0 {
-                return Ok(());
+                return self.report().await;
             }
             tokio::select! {
                 value = self.values.recv() => match value {
@@ -126,7 +136,7 @@ impl Session {
                     Some(Err(text)) => return Err(Some(status(JobError::new(JobErrorKind::Unavailable, text)))),
                     None => return Err(None),
                 },
-                message = requests.message(), if more && self.waiting.is_empty() && (out as usize) < limits::LIVE_TILES_MAX => {
+                message = requests.message(), if more && self.waiting.is_empty() && (out as usize) < self.tiles_max => {
                     match message.map_err(|_| None)? {
                         None => more = false,
                         Some(message) if message.start.is_some() => {
@@ -147,7 +157,7 @@ impl Session {
     }
 
     fn hand_out(&mut self) {
-        while ((self.tile_next - self.answer_next) as usize) < limits::LIVE_TILES_MAX
+        while ((self.tile_next - self.answer_next) as usize) < self.tiles_max
             && let Some(tile) = self.waiting.pop_front()
         {
             self.dispatcher.feed(self.job, self.tile_next, tile);
@@ -159,12 +169,27 @@ impl Session {
     async fn answer(&mut self) -> Result<(), Option<Status>> {
         while let Some(values) = self.done.remove(&self.answer_next) {
             self.answer_next += 1;
-            let answer = v1::ShadePointsResponse { values };
-            let sent = tokio::time::timeout(STALL_MAX, self.answers.send(Ok(answer))).await;
-            if !matches!(sent, Ok(Ok(()))) {
-                return Err(None);
-            }
+            let statistics = None;
+            self.send(v1::ShadePointsResponse { values, statistics }).await?;
         }
         Ok(())
+    }
+
+    /// Tells at the end what it took, where that is wanted.
+    async fn report(&mut self) -> Result<(), Option<Status>> {
+        if !self.reports {
+            return Ok(());
+        }
+        let statistics = self.dispatcher.live_statistics(self.job);
+        let statistics = statistics.as_ref().map(convert::statistics);
+        let values = Vec::new();
+        self.send(v1::ShadePointsResponse { values, statistics }).await
+    }
+
+    async fn send(&mut self, answer: v1::ShadePointsResponse) -> Result<(), Option<Status>> {
+        match tokio::time::timeout(STALL_MAX, self.answers.send(Ok(answer))).await {
+            Ok(Ok(())) => Ok(()),
+            _ => Err(None),
+        }
     }
 }

@@ -83,12 +83,13 @@ impl Builds {
 }
 
 fn start(plan: &Plan) -> io::Result<(Child, BuildChild)> {
-    let mut child = Command::new(&plan.server_binary)
+    let mut command = Command::new(&plan.server_binary);
+    command
         .arg("build-child")
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()?;
+        .stderr(Stdio::piped());
+    let mut child = (plan.spawn)(&mut command)?;
     let pid = child.id();
     exempt_daemon(pid);
     let (Some(stdin), Some(stdout), Some(stderr)) = (child.stdin.take(), child.stdout.take(), child.stderr.take())

@@ -249,14 +249,15 @@ impl Slot {
 fn start(plan: &Plan, seat: Seat, nursery: &mut impl Nursery) -> io::Result<Child> {
     let token = random_token()?;
     let (ours, theirs) = UnixStream::pair()?;
-    let mut child = Command::new(&plan.worker_binary)
+    let mut command = Command::new(&plan.worker_binary);
+    command
         .arg("--page-channel")
         .arg("0")
         .arg("--queue")
         .arg(&plan.queue_socket)
         .stdin(OwnedFd::from(theirs))
-        .stdout(Stdio::null())
-        .spawn()?;
+        .stdout(Stdio::null());
+    let mut child = (plan.spawn)(&mut command)?;
     let pid = child.id();
     exempt_daemon(pid);
     let birth = WorkerBirth { seat, pid, token };

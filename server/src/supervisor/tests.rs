@@ -4,6 +4,7 @@ use super::*;
 use std::collections::HashMap;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 #[derive(Default)]
@@ -40,11 +41,20 @@ impl Nursery for Witness {
 }
 
 fn start(worker: &Path, workers: u8) -> (Handle, Witness) {
+    start_with(worker, workers, process::Command::spawn)
+}
+
+fn start_with(
+    worker: &Path,
+    workers: u8,
+    spawn: fn(&mut process::Command) -> io::Result<process::Child>,
+) -> (Handle, Witness) {
     let plan = Plan {
         workers,
         worker_binary: worker.to_owned(),
         queue_socket: "/nowhere".into(),
         server_binary: "/bin/cat".into(),
+        spawn,
     };
     let witness = Witness::default();
     let (handle, _) = Supervisor::start(plan, |_| witness.clone()).unwrap();
@@ -65,12 +75,12 @@ fn script(folder: &Path, name: &str, text: &str) -> PathBuf {
 }
 
 fn wait<T>(witness: &Witness, what: &str, mut found: impl FnMut(&mut Log) -> Option<T>) -> T {
-    let deadline = Instant::now() + Duration::from_secs(20);
+    let deadline = Instant::now() + Duration::from_secs(60);
     loop {
         if let Some(value) = found(&mut witness.0.lock().unwrap()) {
             return value;
         }
-        assert!(Instant::now() < deadline, "no {what} within 20 s");
+        assert!(Instant::now() < deadline, "no {what} within 60 s");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -123,6 +133,45 @@ fn workers_that_never_get_ready_park_their_slot_after_five_deaths() {
     assert_eq!(slots, 1);
     assert!(reason.contains("before it was ready: exit status: 1"), "{reason}");
     assert_eq!(witness.0.lock().unwrap().deaths.len(), limits::PARK_DEATHS);
+    handle.stop();
+}
+
+/// Attempts to make a process while there are too many, and whether there are.
+static ATTEMPTS: AtomicUsize = AtomicUsize::new(0);
+static CROWDED: AtomicBool = AtomicBool::new(true);
+
+fn spawn_when_there_is_room(command: &mut process::Command) -> io::Result<process::Child> {
+    if CROWDED.load(Ordering::SeqCst) {
+        ATTEMPTS.fetch_add(1, Ordering::SeqCst);
+        return Err(nix::errno::Errno::EAGAIN.into());
+    }
+    command.spawn()
+}
+
+#[test]
+fn processes_that_cannot_be_made_park_their_slots_until_there_is_room_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let (handle, witness) = start_with(&sleeper(folder.path()), 2, spawn_when_there_is_room);
+    let (slots, reason) = wait(&witness, "parking", |log| {
+        log.parked.clone().filter(|parked| parked.0 == 2)
+    });
+    assert!(reason.contains("sleeper: Resource temporarily unavailable"), "{reason}");
+    assert_eq!(ATTEMPTS.load(Ordering::SeqCst), slots * limits::PARK_DEATHS);
+    // Neither builds nor anything else ends the daemon.
+    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    let refused = runtime.block_on(handle.build(1)).unwrap_err();
+    assert_eq!(refused.raw_os_error(), Some(nix::libc::EAGAIN));
+    CROWDED.store(false, Ordering::SeqCst);
+    // As every job that comes in does.
+    let births = wait(&witness, "births", |log| {
+        handle.unpark();
+        (log.births.len() == slots).then_some(log.births.len())
+    });
+    println!(
+        "RELIABILITY O4: EAGAIN for {slots} workers: parked after {} attempts each, a build refused with it; \
+         {births} workers as soon as there was room",
+        limits::PARK_DEATHS
+    );
     handle.stop();
 }
 

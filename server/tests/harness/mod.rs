@@ -7,15 +7,56 @@ use hyper_util::rt::TokioIo;
 use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_client::DaemonServiceClient;
 use pbgi_proto::v1::job_service_client::JobServiceClient;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, ErrorKind, Read};
+use std::net::TcpListener;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
+use tokio::net::UnixStream;
 use tonic::transport::{Channel, Endpoint};
 
 pub(crate) const SERVER: &str = env!("CARGO_BIN_EXE_pbgi-server");
+
+/// How long anything is waited for that must come: far longer than it takes, for a machine that does much else.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Waits until something holds.
+#[track_caller]
+pub(crate) fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !holds() {
+        assert!(Instant::now() < deadline, "not within {PATIENCE:?}: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// A port for a daemon to listen on: free now, and none that the system gives to whoever asks for any.
+pub(crate) fn free_port() -> u16 {
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let first = 16_000 + (std::process::id() % 1_000) as u16 * 16;
+    loop {
+        let port = first + NEXT.fetch_add(1, Ordering::Relaxed);
+        if TcpListener::bind(("127.0.0.1", port)).is_ok() {
+            return port;
+        }
+    }
+}
+
+/// Connects however many wait in the socket's queue.
+async fn connect(path: &Path) -> std::io::Result<UnixStream> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        match UnixStream::connect(path).await {
+            Err(error) if error.kind() == ErrorKind::WouldBlock && Instant::now() < deadline => {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+            outcome => return outcome,
+        }
+    }
+}
 
 pub(crate) struct Daemon {
     pub(crate) child: Child,
@@ -100,9 +141,14 @@ impl Daemon {
         std::fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
     }
 
+    /// The segment that the daemon noted, `None` if it has none.
+    pub(crate) fn noted_segment(&self) -> Option<PathBuf> {
+        let name = std::fs::read_to_string(self.folder.path().join("state/segment")).ok()?;
+        Some(Path::new("/dev/shm").join(name.trim().trim_start_matches('/')))
+    }
+
     pub(crate) fn segment(&self) -> PathBuf {
-        let name = std::fs::read_to_string(self.folder.path().join("state/segment")).unwrap();
-        Path::new("/dev/shm").join(name.trim().trim_start_matches('/'))
+        self.noted_segment().unwrap()
     }
 
     pub(crate) fn signal(&self, signal: &str) {
@@ -111,7 +157,7 @@ impl Daemon {
     }
 
     pub(crate) fn wait(&mut self) -> ExitStatus {
-        let deadline = Instant::now() + Duration::from_secs(20);
+        let deadline = Instant::now() + PATIENCE;
         loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 return status;
@@ -146,7 +192,7 @@ impl Daemon {
         let path = self.folder.path().join("run").join(socket);
         let connector = tower::service_fn(move |_| {
             let path = path.clone();
-            async move { tokio::net::UnixStream::connect(path).await.map(TokioIo::new) }
+            async move { connect(&path).await.map(TokioIo::new) }
         });
         Endpoint::from_static("http://localhost")
             .connect_with_connector(connector)
@@ -168,16 +214,16 @@ impl Drop for Daemon {
     fn drop(&mut self) {
         // Its children end with it; its segment is removed here if a test failed.
         if self.child.try_wait().is_ok_and(|status| status.is_none()) {
-            let segment = self.segment();
             let _ = self.child.kill();
             let _ = self.child.wait();
-            let _ = std::fs::remove_file(segment);
+            let _ = self.noted_segment().map(std::fs::remove_file);
         }
     }
 }
 
-/// Process ids of a process's children.
+/// Process ids of the children that run another program by now.
 pub(crate) fn children(pid: u32) -> Vec<u32> {
+    let line = |pid: u32| std::fs::read(format!("/proc/{pid}/cmdline")).ok();
     let parent = |pid: u32| {
         let mut stat = String::new();
         std::fs::File::open(format!("/proc/{pid}/stat"))
@@ -188,5 +234,8 @@ pub(crate) fn children(pid: u32) -> Vec<u32> {
     };
     let entries = std::fs::read_dir("/proc").unwrap().flatten();
     let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
-    pids.filter(|&child| parent(child) == Some(pid)).collect()
+    // Between fork and exec a child is its parent in all but name.
+    let own = line(pid);
+    pids.filter(|&child| parent(child) == Some(pid) && line(child) != own)
+        .collect()
 }

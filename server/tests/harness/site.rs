@@ -1,7 +1,8 @@
 //! A site with a cloud, a G-buffer and a daemon whose workers are the test program in disguise: they fetch pages as a worker does
-//! and answer with values that tell where each receiver was.
+//! and answer with values that tell where each receiver was. [`Site::hold_after`] keeps a picture from being done before its test
+//! has looked.
 
-use super::{Daemon, script};
+use super::{Daemon, PATIENCE, script};
 use hyper_util::rt::TokioIo;
 use pbgi_cache::channel::{self, PageOutcome, PageReply, PageRequest, Welcome};
 use pbgi_cache::{CacheView, LocalCache};
@@ -16,11 +17,18 @@ use pbgi_proto::v1::submit_job_request::Task;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tonic::Request;
 use tonic::transport::{Channel, Endpoint};
 
 const QUEUE_VARIABLE: &str = "PBGI_TEST_QUEUE";
+/// While this folder is in the site's, a worker takes a file out of it for each tile that it finishes, and waits if there is none.
+const HOLD: &str = "hold";
+
+fn held(hold: &Path) -> bool {
+    let taken = |entry: std::fs::DirEntry| std::fs::remove_file(entry.path()).is_ok();
+    std::fs::read_dir(hold).is_ok_and(|entries| !entries.flatten().any(taken))
+}
 
 /// This program as a worker.
 pub(crate) fn disguised(folder: &Path) -> PathBuf {
@@ -68,6 +76,7 @@ async fn work(socket: &UnixStream, queue: PathBuf) {
         slot: welcome.seat.slot.into(),
         epoch: welcome.seat.epoch,
     });
+    let hold = queue.parent().unwrap().with_file_name(HOLD);
     let mut client = QueueServiceClient::new(connect(queue).await);
     let signed = |token: &str| token.parse::<tonic::metadata::MetadataValue<_>>().unwrap();
     macro_rules! signed {
@@ -93,16 +102,18 @@ async fn work(socket: &UnixStream, queue: PathBuf) {
             seat,
             lease_id: lease.lease_id,
         };
-        assert!(
-            client
-                .heartbeat(signed!(heartbeat))
-                .await
-                .unwrap()
-                .into_inner()
-                .lease_valid
-        );
         // Slow enough to be killed in the middle.
         tokio::time::sleep(Duration::from_millis(10)).await;
+        loop {
+            let Ok(answer) = client.heartbeat(signed!(heartbeat)).await else {
+                return;
+            };
+            // A job that was cancelled wants no more of it.
+            if !answer.into_inner().lease_valid || !held(&hold) {
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
         let misses = fetch(socket, &mut cache, &task, &lease);
         let counters = v1::TileCounters {
             receivers: lease.group_lengths.iter().map(|&length| u64::from(length)).sum(),
@@ -209,6 +220,7 @@ pub(crate) fn write_gbuffer(path: &Path, width: u32, height: u32) -> GBuffer {
         data_window: window,
         display_window: window,
         world_to_camera: None,
+        world_to_ndc: None,
         position: (0..pixels).map(place).collect(),
         normal: vec![[0.0, 0.0, 1.0]; pixels],
         coverage: (0..pixels).map(|index| if hole(index) { 0.0 } else { 1.0 }).collect(),
@@ -294,13 +306,33 @@ impl Site {
         self.daemon.jobs().await.get_job(request).await.unwrap().into_inner()
     }
 
+    /// From now on so many tiles are finished and no more: a picture that has more is not done before [`Self::release`].
+    pub(crate) fn hold_after(&self, tiles: u64) {
+        let new = self.daemon.folder.path().join("hold.new");
+        std::fs::create_dir(&new).unwrap();
+        (0..tiles).for_each(|tile| std::fs::write(new.join(tile.to_string()), "").unwrap());
+        self.release();
+        std::fs::rename(new, self.path(HOLD)).unwrap();
+    }
+
+    /// Lets tiles be finished again.
+    pub(crate) fn release(&self) {
+        let old = self.daemon.folder.path().join("hold.old");
+        // Workers take files out of it until it has another name; nothing may be held at all.
+        if std::fs::rename(self.path(HOLD), &old).is_ok() {
+            std::fs::remove_dir_all(old).unwrap();
+        }
+    }
+
     /// Waits until a job has so many tiles done.
     pub(crate) async fn reaches(&self, id: &str, done: u64) -> v1::Job {
+        let deadline = Instant::now() + PATIENCE;
         loop {
             let job = self.job(id).await;
             if job.stage == "shading" && job.done >= done {
                 return job;
             }
+            assert!(Instant::now() < deadline, "{job:?}: {}", self.daemon.log());
             assert!(
                 matches!(job.state(), v1::JobState::Queued | v1::JobState::Running),
                 "{job:?}"

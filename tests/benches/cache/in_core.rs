@@ -4,6 +4,8 @@
 use crate::costs::{MOUNT, owner, with_worker};
 use crate::policy::{arrays, tiles};
 use crate::town::Town;
+use nix::fcntl::{FcntlArg, SealFlag, fcntl};
+use nix::sys::memfd::{MFdFlags, memfd_create};
 use pbgi_core::{NodeIndex, NodeRecord, PageKind, PointIndex, PointRecord, ShadeSettings};
 use pbgi_shade::{Receiver, SceneSource, Shaded, Shader, SourceError};
 use pbgi_store::Scene;
@@ -27,10 +29,14 @@ struct Mapped {
 impl Mapped {
     fn open(scene: &Scene) -> Self {
         let map = |name: &str| {
-            let file = File::open(scene.path().join(name)).unwrap();
-            // SAFETY: the bench made the file and nobody else writes to it.
-            #[expect(unsafe_code, reason = "what is compared with")]
-            unsafe { memmap2::Mmap::map(&file) }.unwrap()
+            // A sealed copy in memory: nobody can write to it, so that mapping it is sound; the kernel serves it like a file
+            // whose pages it holds.
+            let copy = memfd_create(name, MFdFlags::MFD_ALLOW_SEALING | MFdFlags::MFD_CLOEXEC).unwrap();
+            let mut copy = File::from(copy);
+            std::io::copy(&mut File::open(scene.path().join(name)).unwrap(), &mut copy).unwrap();
+            let seals = SealFlag::F_SEAL_SHRINK | SealFlag::F_SEAL_GROW | SealFlag::F_SEAL_WRITE;
+            fcntl(&copy, FcntlArg::F_ADD_SEALS(seals)).unwrap();
+            memmap2::MmapOptions::new().map_if_safe(&copy).unwrap()
         };
         Self {
             nodes: map("nodes.pages"),

@@ -215,6 +215,7 @@ fn one_record_a_page(pages: [u64; 2]) -> SceneInfo {
         bounds: None,
         quantizer: None,
         radius_max: 1.0,
+        origin: [0.0; 3],
         settings: BuildSettings {
             nodes_per_page: 1,
             points_per_page: 1,

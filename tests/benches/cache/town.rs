@@ -148,6 +148,7 @@ impl Town {
             data_window: window,
             display_window: window,
             world_to_camera: None,
+            world_to_ndc: None,
             position: receivers.iter().map(|receiver| receiver.position.to_array()).collect(),
             normal: receivers.iter().map(|receiver| receiver.normal.to_array()).collect(),
             coverage: vec![1.0; receivers.len()],

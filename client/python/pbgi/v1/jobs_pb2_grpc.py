@@ -422,6 +422,11 @@ class SceneServiceStub:
                 request_serializer=pbgi_dot_v1_dot_jobs__pb2.GetSceneRequest.SerializeToString,
                 response_deserializer=pbgi_dot_v1_dot_types__pb2.SceneInfo.FromString,
                 _registered_method=True)
+        self.GetSceneShape = channel.unary_unary(
+                '/pbgi.v1.SceneService/GetSceneShape',
+                request_serializer=pbgi_dot_v1_dot_jobs__pb2.GetSceneRequest.SerializeToString,
+                response_deserializer=pbgi_dot_v1_dot_jobs__pb2.SceneShape.FromString,
+                _registered_method=True)
         self.WarmScene = channel.unary_unary(
                 '/pbgi.v1.SceneService/WarmScene',
                 request_serializer=pbgi_dot_v1_dot_jobs__pb2.WarmSceneRequest.SerializeToString,
@@ -440,6 +445,13 @@ class SceneServiceServicer:
 
     def GetScene(self, request, context):
         """Opens and verifies a scene, and describes it. It stays open, and its pages warm, until others need the room.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetSceneShape(self, request, context):
+        """How deep a scene's tree is and how full its leaves are. Reads all of its nodes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -466,6 +478,11 @@ def add_SceneServiceServicer_to_server(servicer, server):
                     servicer.GetScene,
                     request_deserializer=pbgi_dot_v1_dot_jobs__pb2.GetSceneRequest.FromString,
                     response_serializer=pbgi_dot_v1_dot_types__pb2.SceneInfo.SerializeToString,
+            ),
+            'GetSceneShape': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetSceneShape,
+                    request_deserializer=pbgi_dot_v1_dot_jobs__pb2.GetSceneRequest.FromString,
+                    response_serializer=pbgi_dot_v1_dot_jobs__pb2.SceneShape.SerializeToString,
             ),
             'WarmScene': grpc.unary_unary_rpc_method_handler(
                     servicer.WarmScene,
@@ -506,6 +523,33 @@ class SceneService:
             '/pbgi.v1.SceneService/GetScene',
             pbgi_dot_v1_dot_jobs__pb2.GetSceneRequest.SerializeToString,
             pbgi_dot_v1_dot_types__pb2.SceneInfo.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetSceneShape(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/pbgi.v1.SceneService/GetSceneShape',
+            pbgi_dot_v1_dot_jobs__pb2.GetSceneRequest.SerializeToString,
+            pbgi_dot_v1_dot_jobs__pb2.SceneShape.FromString,
             options,
             channel_credentials,
             insecure,
@@ -663,6 +707,11 @@ class DaemonServiceStub:
                 request_serializer=pbgi_dot_v1_dot_jobs__pb2.GetStatusRequest.SerializeToString,
                 response_deserializer=pbgi_dot_v1_dot_jobs__pb2.DaemonStatus.FromString,
                 _registered_method=True)
+        self.GetCache = channel.unary_unary(
+                '/pbgi.v1.DaemonService/GetCache',
+                request_serializer=pbgi_dot_v1_dot_jobs__pb2.GetCacheRequest.SerializeToString,
+                response_deserializer=pbgi_dot_v1_dot_jobs__pb2.CacheStatus.FromString,
+                _registered_method=True)
         self.Shutdown = channel.unary_unary(
                 '/pbgi.v1.DaemonService/Shutdown',
                 request_serializer=pbgi_dot_v1_dot_jobs__pb2.ShutdownRequest.SerializeToString,
@@ -676,6 +725,13 @@ class DaemonServiceServicer:
 
     def GetStatus(self, request, context):
         """Missing associated documentation comment in .proto file."""
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetCache(self, request, context):
+        """What the page cache holds, for whom, and how well it does.
+        """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
@@ -694,6 +750,11 @@ def add_DaemonServiceServicer_to_server(servicer, server):
                     servicer.GetStatus,
                     request_deserializer=pbgi_dot_v1_dot_jobs__pb2.GetStatusRequest.FromString,
                     response_serializer=pbgi_dot_v1_dot_jobs__pb2.DaemonStatus.SerializeToString,
+            ),
+            'GetCache': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetCache,
+                    request_deserializer=pbgi_dot_v1_dot_jobs__pb2.GetCacheRequest.FromString,
+                    response_serializer=pbgi_dot_v1_dot_jobs__pb2.CacheStatus.SerializeToString,
             ),
             'Shutdown': grpc.unary_unary_rpc_method_handler(
                     servicer.Shutdown,
@@ -729,6 +790,33 @@ class DaemonService:
             '/pbgi.v1.DaemonService/GetStatus',
             pbgi_dot_v1_dot_jobs__pb2.GetStatusRequest.SerializeToString,
             pbgi_dot_v1_dot_jobs__pb2.DaemonStatus.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetCache(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/pbgi.v1.DaemonService/GetCache',
+            pbgi_dot_v1_dot_jobs__pb2.GetCacheRequest.SerializeToString,
+            pbgi_dot_v1_dot_jobs__pb2.CacheStatus.FromString,
             options,
             channel_credentials,
             insecure,

@@ -39,6 +39,7 @@ pub(crate) fn scene(pages: u32) -> SceneInfo {
         bounds: None,
         quantizer: None,
         radius_max: 1.0,
+        origin: [0.0; 3],
         settings,
     };
     assert_eq!(

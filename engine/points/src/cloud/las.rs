@@ -115,7 +115,7 @@ fn upright([x, y, z]: [f32; 3]) -> [f32; 3] {
     [x, z, -y]
 }
 
-fn open(path: &Path) -> Result<Reader, PointsError> {
+pub(crate) fn open(path: &Path) -> Result<Reader, PointsError> {
     const BUFFER_BYTES: usize = 1 << 18;
     let file = File::open(path).map_err(PointsError::io("open", path))?;
     let length = file.metadata().map_err(PointsError::io("read", path))?.len();
@@ -136,7 +136,7 @@ fn open(path: &Path) -> Result<Reader, PointsError> {
     Ok(reader)
 }
 
-fn damaged(path: &Path, error: las::Error) -> PointsError {
+pub(crate) fn damaged(path: &Path, error: las::Error) -> PointsError {
     match error {
         las::Error::Io(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
             PointsError::io("read", path)(source)
@@ -170,13 +170,18 @@ fn decode(path: &Path) -> Result<Receiver<Result<PointData, las::Error>>, Points
         .map_err(PointsError::io("start a thread to read", path))
 }
 
-fn linear_table(first: &PointData) -> Vec<f32> {
+/// The level of white: 8 or 16 bits, told by the brightest colour of a file's first points.
+pub(crate) fn white_of(first: &PointData) -> u16 {
     let brightest = first.rgb().into_iter().flatten().map(|(r, g, b)| r.max(g).max(b)).max();
-    let white = if brightest.unwrap_or(u16::MAX) > u16::from(u8::MAX) {
+    if brightest.unwrap_or(u16::MAX) > u16::from(u8::MAX) {
         u16::MAX
     } else {
         u16::from(u8::MAX)
-    };
+    }
+}
+
+fn linear_table(first: &PointData) -> Vec<f32> {
+    let white = white_of(first);
     let level = |level: u16| linear_from_srgb(f64::from(level) / f64::from(white)) as f32;
     (0..=u16::MAX).map(level).collect()
 }
@@ -250,6 +255,10 @@ impl Cloud for LasPoints {
 
     fn skipped(&self) -> u64 {
         self.door.skipped()
+    }
+
+    fn number(&mut self) {
+        self.door.number();
     }
 
     fn is_aerial(&self) -> bool {

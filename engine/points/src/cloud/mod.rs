@@ -5,6 +5,7 @@ pub(crate) mod ptc;
 pub(crate) mod scene_points;
 
 use crate::error::PointsError;
+use half::f16;
 use pbgi_core::{InvalidPoint, PointRecord, PointStream};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -76,10 +77,31 @@ pub(crate) trait Cloud: PointStream<Error = PointsError> + Send {
     /// Points dropped since the start of this reading.
     fn skipped(&self) -> u64;
 
+    /// From now on points carry their place in the file instead of their light: see [`place_of`].
+    fn number(&mut self);
+
     /// Whether the scan was made from above.
     fn is_aerial(&self) -> bool {
         false
     }
+}
+
+/// The point with its place in the file where its radiance was.
+fn numbered(point: PointRecord, place: u64) -> PointRecord {
+    let word = |index: u32| f16::from_bits((place >> (16 * index)) as u16);
+    PointRecord {
+        front_radiance: [word(0), word(1), word(2)],
+        back_radiance: [word(3), f16::ZERO, f16::ZERO],
+        ..point
+    }
+}
+
+/// Place in its file of a point that a numbered cloud gave.
+pub(crate) fn place_of(point: &PointRecord) -> u64 {
+    let words = point.front_radiance.iter().chain(&point.back_radiance[..1]);
+    words
+        .rev()
+        .fold(0, |place, word| place << 16 | u64::from(word.to_bits()))
 }
 
 pub(crate) const NORMAL_PLACEHOLDER: [f32; 3] = [0.0, 1.0, 0.0];
@@ -94,6 +116,7 @@ pub(crate) struct Door {
     seen: u64,
     invalid: u64,
     first: Option<(u64, InvalidPoint)>,
+    numbers: bool,
 }
 
 impl Door {
@@ -105,13 +128,20 @@ impl Door {
             seen: 0,
             invalid: 0,
             first: None,
+            numbers: false,
         }
+    }
+
+    /// See [`Cloud::number`].
+    pub(crate) fn number(&mut self) {
+        self.numbers = true;
     }
 
     /// Takes the next point of the file.
     #[inline]
     pub(crate) fn take(&mut self, point: Result<PointRecord, InvalidPoint>, batch: &mut Vec<PointRecord>) {
         match point {
+            Ok(point) if self.numbers => batch.push(numbered(point, self.seen)),
             Ok(point) => batch.push(point),
             Err(reason) => self.turn_away(reason),
         }
@@ -163,5 +193,14 @@ pub(crate) fn linear_from_srgb(encoded: f64) -> f64 {
         encoded / 12.92
     } else {
         ((encoded + 0.055) / 1.055).powf(2.4)
+    }
+}
+
+/// The inverse of [`linear_from_srgb`].
+pub(crate) fn srgb_from_linear(linear: f64) -> f64 {
+    if linear <= 0.003_130_8 {
+        linear * 12.92
+    } else {
+        1.055 * linear.powf(1.0 / 2.4) - 0.055
     }
 }

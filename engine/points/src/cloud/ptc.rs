@@ -262,4 +262,8 @@ impl Cloud for PtcPoints {
     fn skipped(&self) -> u64 {
         self.door.skipped()
     }
+
+    fn number(&mut self) {
+        self.door.number();
+    }
 }

@@ -45,6 +45,10 @@ impl PointStream for ScenePoints {
         Some(self.scene.info().point_count)
     }
 
+    fn origin(&self) -> [f64; 3] {
+        self.scene.info().origin
+    }
+
     fn next_batch(&mut self, batch: &mut Vec<PointRecord>) -> Result<bool, PointsError> {
         let info = self.scene.info();
         if self.next == info.page_count(PageKind::Point) {
@@ -80,5 +84,9 @@ impl Cloud for ScenePoints {
 
     fn skipped(&self) -> u64 {
         self.door.skipped()
+    }
+
+    fn number(&mut self) {
+        self.door.number();
     }
 }

@@ -15,8 +15,7 @@ use glam::Vec3;
 use neighbours::Neighbours;
 use order::{Census, Dealer, Ordered};
 use pbgi_core::limits::MORTON_BITS;
-use pbgi_core::point::Sides;
-use pbgi_core::{Bounds, MortonCode, PointRecord, PointStream, Quantizer};
+use pbgi_core::{Bounds, MortonCode, PointRecord, PointStream, Quantizer, octahedral};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -172,6 +171,11 @@ impl Estimated {
 
 impl Wanted {
     fn block(&self, ordered: &Ordered, range: Range<u64>) -> Result<Vec<PointRecord>, PointsError> {
+        if self.facing.is_none() && self.radius.is_none() {
+            let mut block = Vec::new();
+            ordered.read(range, &mut block)?;
+            return Ok(block);
+        }
         let (points, own) = surroundings(ordered, range)?;
         let positions: Vec<Vec3> = points.iter().map(|point| Vec3::from(point.position)).collect();
         let neighbours = Neighbours::new(&positions);
@@ -203,21 +207,17 @@ impl Wanted {
                     surface::radius_of(squared.sqrt(), found.len()).max(cell)
                 }),
             };
-            block.push(remade(&point, normal, radius)?);
+            block.push(PointRecord {
+                normal_code: octahedral::encode(normal),
+                radius,
+                ..point
+            });
         }
         if self.radius == Some(Radius::Estimate) {
             limit_radii(&mut block);
         }
         Ok(block)
     }
-}
-
-/// The point with another normal and radius.
-fn remade(point: &PointRecord, normal: Vec3, radius: f32) -> Result<PointRecord, PointsError> {
-    let Sides { front, back } = point.sides();
-    // Radiance went through half precision before, and does not change again.
-    PointRecord::new(point.position, normal.to_array(), radius, Sides { front, back })
-        .map_err(|error| PointsError::Request(format!("an estimated point is unusable: {error}")))
 }
 
 fn limit_radii(block: &mut [PointRecord]) {

@@ -1,9 +1,16 @@
-//! The G-buffer: what the camera sees in each pixel, rendered from a mesh or read from another renderer's passes.
+//! The G-buffer: what the camera sees in each pixel, rendered from a mesh, put together from what rays
+//! met in a scene, or read from another renderer's passes.
 
+mod hits;
+mod pass_through;
 mod read;
 mod render;
+mod space;
 
-pub use read::GBufferChannels;
+pub use hits::{HitBuffer, RayHit};
+pub use pass_through::PassThrough;
+pub use read::GBufferOptions;
+pub use space::Space;
 
 use crate::error::PointsError;
 use crate::image::{LayeredImage, Precision, Window};
@@ -19,6 +26,8 @@ pub struct GBuffer {
     pub display_window: Window,
     /// The standard EXR attribute (see [`crate::Camera::exr_world_to_camera`]).
     pub world_to_camera: Option<Mat4>,
+    /// The standard EXR attribute (see [`crate::Camera::exr_world_to_ndc`]).
+    pub world_to_ndc: Option<Mat4>,
     /// World position.
     pub position: Vec<[f32; 3]>,
     /// World normal on the camera's side, unit length when rendered here, used as stored when read.
@@ -57,6 +66,7 @@ impl GBuffer {
     pub fn to_image(&self) -> LayeredImage {
         let mut image = LayeredImage::with_windows(self.data_window, self.display_window);
         image.world_to_camera = self.world_to_camera;
+        image.world_to_ndc = self.world_to_ndc;
         image.add_xyz("P", Precision::Float, &self.position);
         image.add_xyz("N", Precision::Float, &self.normal);
         for (layer, pixels) in [

@@ -1,18 +1,20 @@
 //! Other renderers' passes: positions and normals under the many names they have.
 
-use super::GBuffer;
+use super::{GBuffer, Space};
 use crate::error::PointsError;
-use crate::image::LayeredImage;
-use crate::image::channel_names;
+use crate::image::{LayeredImage, contents, read};
+use std::fs::File;
 use std::path::Path;
 
-/// Names of the layers to read, where the usual ones (`P`, `Pworld`, `WP`, `position`; `N`, `Nworld`, `normal`) do not fit.
+/// How an EXR file is read, where the usual way does not fit.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct GBufferChannels {
-    /// Layer of the world position.
+pub struct GBufferOptions {
+    /// Layer of the position; `None` for the usual names (`P`, `Pworld`, `WP`, `position`).
     pub position: Option<String>,
-    /// Layer of the world normal.
+    /// Layer of the normal; `None` for the usual names (`N`, `Nworld`, `normal`).
     pub normal: Option<String>,
+    /// What space both are in.
+    pub space: Space,
 }
 
 const POSITION_NAMES: [&str; 8] = [
@@ -32,21 +34,23 @@ const EMISSION_NAMES: [&str; 1] = ["emission"];
 const COVERAGE_NAMES: [&str; 2] = ["a", "alpha"];
 
 impl GBuffer {
-    /// Reads an EXR file with the usual layer names.
+    /// Reads an EXR file the usual way.
     ///
     /// # Errors
-    /// As [`Self::read_named`].
+    /// As [`Self::read_with`].
     pub fn read(path: &Path) -> Result<Self, PointsError> {
-        Self::read_named(path, &GBufferChannels::default())
+        Self::read_with(path, &GBufferOptions::default())
     }
 
     /// Reads an EXR file. Layers are found whatever their case, with the suffixes `.X .Y .Z` or `.R .G .B`, alone or below
     /// another layer (`ViewLayer.Position.X`). Without a channel `A`, every pixel with a normal is covered.
     ///
     /// # Errors
-    /// No or a damaged file, a picture beyond the limits, or no position or normal: the error lists the channels there are.
-    pub fn read_named(path: &Path, channels: &GBufferChannels) -> Result<Self, PointsError> {
-        let names = channel_names(path)?;
+    /// No or a damaged file, a picture beyond the limits, no position or normal (the error lists the channels there are), or
+    /// positions that are in another space than `options` say.
+    pub fn read_with(path: &Path, options: &GBufferOptions) -> Result<Self, PointsError> {
+        let file = File::open(path).map_err(PointsError::io("open", path))?;
+        let names = contents(path, &file)?.channels;
         let find = |what: &str, flag: &str, wanted: Option<&String>, usual: &[&str]| {
             let layer = match wanted {
                 Some(layer) => find_layer(&names, &[&layer.to_ascii_lowercase()]),
@@ -54,8 +58,8 @@ impl GBuffer {
             };
             layer.ok_or_else(|| missing(path, what, flag, wanted, usual, &names))
         };
-        let position = find("position", "--position", channels.position.as_ref(), &POSITION_NAMES)?;
-        let normal = find("normal", "--normal", channels.normal.as_ref(), &NORMAL_NAMES)?;
+        let position = find("position", "--position", options.position.as_ref(), &POSITION_NAMES)?;
+        let normal = find("normal", "--normal", options.normal.as_ref(), &NORMAL_NAMES)?;
         let albedo = find_layer(&names, &ALBEDO_NAMES);
         let direct = find_layer(&names, &DIRECT_NAMES);
         let emission = find_layer(&names, &EMISSION_NAMES);
@@ -67,7 +71,7 @@ impl GBuffer {
             direct.as_ref(),
             emission.as_ref(),
         ];
-        let image = LayeredImage::read_exr_channels(path, |name| {
+        let image = read(path, &file, None, |name| {
             let in_layer = layers.iter().flatten().any(|layer| layer.contains(&name.to_owned()));
             in_layer || coverage.as_deref() == Some(name)
         })?;
@@ -77,10 +81,11 @@ impl GBuffer {
                 .ok_or_else(|| PointsError::invalid(path, "a channel has no pixels"))
         };
         let pixel_count = image.data_window.pixel_count();
-        Ok(Self {
+        let gbuffer = Self {
             data_window: image.data_window,
             display_window: image.display_window,
             world_to_camera: image.world_to_camera,
+            world_to_ndc: image.world_to_ndc,
             position: required(&position)?,
             normal: required(&normal)?,
             coverage: coverage
@@ -89,7 +94,8 @@ impl GBuffer {
             albedo: albedo.and_then(|layer| layer.pixels(&image)),
             direct: direct.and_then(|layer| layer.pixels(&image)),
             emission: emission.and_then(|layer| layer.pixels(&image)),
-        })
+        };
+        gbuffer.into_world(path, options.space)
     }
 }
 

@@ -67,6 +67,7 @@ impl GBuffer {
             data_window: window,
             display_window: window,
             world_to_camera: Some(camera.exr_world_to_camera()),
+            world_to_ndc: Some(camera.exr_world_to_ndc(width, height)),
             position: layer(|pixel| pixel.position),
             normal: layer(|pixel| pixel.normal),
             coverage: pixels.iter().map(|pixel| pixel.coverage).collect(),

@@ -1,20 +1,22 @@
-//! EXR to [`LayeredImage`]: scanlines or tiles, one part or several with the same data window. Headers are checked against
-//! [`crate::limits`] before a pixel is decoded, and only the channels asked for take memory.
+//! EXR to [`LayeredImage`]: scanlines or tiles, one part or several. Headers are checked against [`crate::limits`] before a
+//! pixel is decoded, and only the channels asked for take memory.
 
-use super::{Channel, LayeredImage, Precision, Window};
+use super::{Attributes, Channel, LayeredImage, Precision, Window};
 use crate::error::PointsError;
 use crate::limits;
 use exr::block::UncompressedBlock;
 use exr::block::chunk::TileCoordinates;
+use exr::block::lines::LineRef;
 use exr::block::reader::ChunksReader;
 use exr::meta::MetaData;
-use exr::meta::attribute::{AttributeValue, IntegerBounds, SampleType};
+use exr::meta::attribute::{IntegerBounds, SampleType};
 use exr::meta::header::Header;
 use exr::prelude::Vec2;
+use glam::Mat4;
 use half::f16;
 use pbgi_core::limits::IMAGE_PIXELS_MAX;
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufReader, Seek, SeekFrom};
 use std::path::Path;
 
 impl LayeredImage {
@@ -26,73 +28,93 @@ impl LayeredImage {
         Self::read_exr_channels(path, |_| true)
     }
 
-    /// Reads the channels whose full name (`part.channel` where a file has several parts) `keep` accepts.
+    /// Reads the channels whose full name (`part.channel` where a file has several parts) `keep` accepts. Parts of different
+    /// data windows are put into the smallest one that holds all of them, with 0 where a part has no pixels.
     ///
     /// # Errors
-    /// No or a damaged file, deep or subsampled data, parts of different sizes, more pixels or channels than the limits.
+    /// No or a damaged file, deep or subsampled data, more pixels or channels than the limits.
     pub fn read_exr_channels(path: &Path, keep: impl Fn(&str) -> bool) -> Result<Self, PointsError> {
         let file = File::open(path).map_err(PointsError::io("open", path))?;
-        let reader = exr::block::read(BufReader::new(file), false).map_err(damaged(path))?;
-        let mut image = describe(path, reader.headers())?;
-        let plan = Plan::new(path, reader.headers(), keep)?;
-        let mut values: Vec<Vec<f32>> = plan
-            .names
-            .iter()
-            .map(|_| vec![0.0; image.data_window.pixel_count()])
-            .collect();
-        let width = image.data_window.width as usize;
-        let largest_level = |_: &MetaData, _: TileCoordinates, block: exr::block::BlockIndex| {
-            block.level == Vec2(0, 0) && plan.slots[block.layer].iter().any(Option::is_some)
-        };
-        reader
-            .filter_chunks(false, largest_level)
-            .and_then(|chunks| {
-                chunks.decompress_sequential(false, |meta, block| {
-                    store_block(&plan, &meta.headers, &block, width, &mut values)
-                })
-            })
-            .map_err(damaged(path))?;
-        for ((name, precision), values) in plan.names.into_iter().zip(values) {
-            image.channels.insert(name, Channel { precision, values });
-        }
-        Ok(image)
+        read(path, &file, None, keep)
     }
 }
 
-/// The names of all channels of an EXR file, without reading its pixels.
-pub(crate) fn channel_names(path: &Path) -> Result<Vec<String>, PointsError> {
-    let file = File::open(path).map_err(PointsError::io("open", path))?;
-    let reader = exr::block::read(BufReader::new(file), false).map_err(damaged(path))?;
+/// Reads channels of an open file, into `data_window` if there is one: pixels beyond it are left out.
+pub(crate) fn read(
+    path: &Path,
+    file: &File,
+    data_window: Option<Window>,
+    keep: impl Fn(&str) -> bool,
+) -> Result<LayeredImage, PointsError> {
+    let reader = exr::block::read(from_start(path, file)?, false).map_err(damaged(path))?;
     check_limits(path, reader.headers())?;
-    let mut names = Vec::new();
-    for header in reader.headers() {
-        names.extend(
-            header
-                .channels
-                .list
-                .iter()
-                .map(|c| full_name(reader.headers(), header, c)),
-        );
+    let plan = Plan::new(path, reader.headers(), keep, data_window)?;
+    let mut image = describe(reader.headers(), plan.window);
+    let pixels = plan.window.pixel_count();
+    let mut values: Vec<Vec<f32>> = plan.names.iter().map(|_| vec![0.0; pixels]).collect();
+    let largest_level = |_: &MetaData, _: TileCoordinates, block: exr::block::BlockIndex| {
+        block.level == Vec2(0, 0) && plan.slots[block.layer].iter().any(Option::is_some)
+    };
+    reader
+        .filter_chunks(false, largest_level)
+        .and_then(|chunks| {
+            chunks.decompress_sequential(false, |meta, block| {
+                store_block(&plan, &meta.headers, &block, &mut values)
+            })
+        })
+        .map_err(damaged(path))?;
+    for ((name, precision), values) in plan.names.into_iter().zip(values) {
+        image.channels.insert(name, Channel { precision, values });
     }
-    Ok(names)
+    Ok(image)
+}
+
+/// What an EXR file says of itself: its names of channels, and its texts.
+pub(crate) struct Contents {
+    pub(crate) channels: Vec<String>,
+    pub(crate) metadata: std::collections::BTreeMap<String, String>,
+}
+
+/// Looks at an EXR file without reading its pixels.
+pub(crate) fn contents(path: &Path, file: &File) -> Result<Contents, PointsError> {
+    let reader = exr::block::read(from_start(path, file)?, false).map_err(damaged(path))?;
+    let headers = reader.headers();
+    check_limits(path, headers)?;
+    let named = |header| channel_names(headers, header);
+    Ok(Contents {
+        channels: headers.iter().flat_map(named).collect(),
+        metadata: Attributes::of(headers).1,
+    })
+}
+
+fn from_start<'a>(path: &Path, mut file: &'a File) -> Result<BufReader<&'a File>, PointsError> {
+    file.seek(SeekFrom::Start(0)).map_err(PointsError::io("read", path))?;
+    Ok(BufReader::new(file))
 }
 
 /// Where each channel of each part goes.
 struct Plan {
+    window: Window,
     slots: Vec<Vec<Option<usize>>>,
     names: Vec<(String, Precision)>,
 }
 
 impl Plan {
-    fn new(path: &Path, headers: &[Header], keep: impl Fn(&str) -> bool) -> Result<Self, PointsError> {
+    fn new(
+        path: &Path,
+        headers: &[Header],
+        keep: impl Fn(&str) -> bool,
+        window: Option<Window>,
+    ) -> Result<Self, PointsError> {
         let mut plan = Self {
+            window: Window::of_size(0, 0),
             slots: Vec::new(),
             names: Vec::new(),
         };
+        let mut windows = Vec::new();
         for header in headers {
             let mut slots = Vec::new();
-            for channel in &header.channels.list {
-                let name = full_name(headers, header, channel);
+            for (channel, name) in header.channels.list.iter().zip(channel_names(headers, header)) {
                 let known = plan.names.iter().any(|(other, _)| *other == name);
                 if known || !keep(&name) {
                     slots.push(None);
@@ -109,10 +131,45 @@ impl Plan {
                 };
                 plan.names.push((name, precision));
             }
+            if slots.iter().any(Option::is_some) {
+                if header.deep {
+                    return Err(PointsError::unsupported(path, "deep data", "flatten the image first"));
+                }
+                windows.push(part_window(header));
+            }
             plan.slots.push(slots);
         }
+        plan.window = match window {
+            Some(window) => window,
+            None => union(&windows).unwrap_or_else(|| part_window(&headers[0])),
+        };
+        let pixels = u64::from(plan.window.width) * u64::from(plan.window.height);
+        limit(path, "number of pixels of all parts together", pixels, IMAGE_PIXELS_MAX)?;
+        let bytes = pixels * (plan.names.len() * size_of::<f32>()) as u64;
+        limit(path, "size of the pixels in bytes", bytes, limits::EXR_BYTES_MAX)?;
         Ok(plan)
     }
+}
+
+/// The smallest window around all; `None` of none.
+fn union(windows: &[Window]) -> Option<Window> {
+    let end = |start: i32, length: u32| i64::from(start) + i64::from(length);
+    let x = windows.iter().map(|window| window.x).min()?;
+    let y = windows.iter().map(|window| window.y).min()?;
+    let right = windows.iter().map(|window| end(window.x, window.width)).max()?;
+    let bottom = windows.iter().map(|window| end(window.y, window.height)).max()?;
+    Some(Window {
+        x,
+        y,
+        width: (right - i64::from(x)) as u32,
+        height: (bottom - i64::from(y)) as u32,
+    })
+}
+
+/// Full names of a part's channels, in its order.
+fn channel_names(headers: &[Header], header: &Header) -> Vec<String> {
+    let full = |channel| full_name(headers, header, channel);
+    header.channels.list.iter().map(full).collect()
 }
 
 fn full_name(headers: &[Header], header: &Header, channel: &exr::meta::attribute::ChannelDescription) -> String {
@@ -127,103 +184,100 @@ fn store_block(
     plan: &Plan,
     headers: &[Header],
     block: &UncompressedBlock,
-    width: usize,
     values: &mut [Vec<f32>],
 ) -> exr::error::UnitResult {
-    let layer = block.index.layer;
-    for line in block.lines(&headers[layer].channels) {
-        let Some(slot) = plan.slots[layer][line.location.channel] else {
+    let header = &headers[block.index.layer];
+    let part = part_window(header);
+    for line in block.lines(&header.channels) {
+        let Some(slot) = plan.slots[block.index.layer][line.location.channel] else {
             continue;
         };
-        let start = line.location.position.y() * width + line.location.position.x();
-        let row = values[slot].get_mut(start..start + line.location.sample_count);
-        let row = row.ok_or_else(|| exr::error::Error::Invalid("block outside of the data window".into()))?;
-        match headers[layer].channels.list[line.location.channel].sample_type {
-            SampleType::F16 => {
-                for (value, sample) in row.iter_mut().zip(line.read_samples::<f16>()) {
-                    *value = sample?.to_f32();
-                }
-            }
-            SampleType::F32 => line.read_samples_into_slice(row)?,
-            SampleType::U32 => {
-                for (value, sample) in row.iter_mut().zip(line.read_samples::<u32>()) {
-                    *value = sample? as f32;
-                }
-            }
+        let (x, y) = (line.location.position.x() as i64, line.location.position.y() as i64);
+        let count = line.location.sample_count as i64;
+        if x + count > i64::from(part.width) || y >= i64::from(part.height) {
+            return Err(exr::error::Error::Invalid("block outside of the data window".into()));
+        }
+        let column = x + i64::from(part.x) - i64::from(plan.window.x);
+        let row = y + i64::from(part.y) - i64::from(plan.window.y);
+        let width = i64::from(plan.window.width);
+        let (first, end) = (column.clamp(0, width), (column + count).clamp(0, width));
+        if first == end || !(0..i64::from(plan.window.height)).contains(&row) {
+            continue;
+        }
+        let start = row * width;
+        let target = &mut values[slot][(start + first) as usize..(start + end) as usize];
+        let skip = (first - column) as usize;
+        match header.channels.list[line.location.channel].sample_type {
+            SampleType::F16 => fill(line, skip, target, f16::to_f32)?,
+            SampleType::F32 => fill(line, skip, target, |sample: f32| sample)?,
+            SampleType::U32 => fill(line, skip, target, |sample: u32| sample as f32)?,
         }
     }
     Ok(())
 }
 
-fn describe(path: &Path, headers: &[Header]) -> Result<LayeredImage, PointsError> {
-    check_limits(path, headers)?;
-    let first = &headers[0];
-    let data_window = window(&IntegerBounds {
-        position: first.own_attributes.layer_position,
-        size: first.layer_size,
-    });
-    let mut image = LayeredImage::with_windows(data_window, window(&first.shared_attributes.display_window));
-    for header in headers {
-        if header.layer_size != first.layer_size
-            || header.own_attributes.layer_position != first.own_attributes.layer_position
-        {
-            let what = "a file whose parts have different data windows";
-            return Err(PointsError::unsupported(
-                path,
-                what,
-                "write all passes with one data window",
-            ));
-        }
-        if header.deep {
-            return Err(PointsError::unsupported(path, "deep data", "flatten the image first"));
-        }
-        image.world_to_camera = image.world_to_camera.or(header
-            .own_attributes
-            .world_to_camera
-            .map(|m| glam::Mat4::from_cols_array(&m)));
-        let attributes = header
-            .own_attributes
-            .other
-            .iter()
-            .chain(&header.shared_attributes.other);
-        for (key, value) in attributes {
-            if let AttributeValue::Text(text) = value {
-                image.metadata.insert(key.to_string(), text.to_string());
-            }
-        }
+fn fill<T: exr::io::Data>(
+    line: LineRef<'_>,
+    skip: usize,
+    target: &mut [f32],
+    convert: impl Fn(T) -> f32,
+) -> exr::error::UnitResult {
+    for (value, sample) in target.iter_mut().zip(line.read_samples::<T>().skip(skip)) {
+        *value = convert(sample?);
     }
-    Ok(image)
+    Ok(())
+}
+
+fn describe(headers: &[Header], data_window: Window) -> LayeredImage {
+    let mut image = LayeredImage::with_windows(data_window, window(&headers[0].shared_attributes.display_window));
+    (image.attributes, image.metadata) = Attributes::of(headers);
+    let mut own = headers.iter().map(|header| &header.own_attributes);
+    let matrix = |array: [f32; 16]| Mat4::from_cols_array(&array);
+    image.world_to_camera = own.clone().find_map(|own| own.world_to_camera).map(matrix);
+    image.world_to_ndc = own.find_map(|own| own.world_to_normalized_device).map(matrix);
+    image
 }
 
 /// Refuses what would take too much memory, from the headers alone.
 fn check_limits(path: &Path, headers: &[Header]) -> Result<(), PointsError> {
-    let limit = |what, value: u64, limit: u64| {
-        if value <= limit {
-            return Ok(());
-        }
-        Err(PointsError::Limit {
-            what,
-            value,
-            limit,
-            path: path.to_owned(),
-        })
-    };
-    limit("number of parts", headers.len() as u64, limits::EXR_PARTS_MAX as u64)?;
+    let parts = headers.len();
+    limit(path, "number of parts", parts as u64, limits::EXR_PARTS_MAX as u64)?;
     let channels: usize = headers.iter().map(|header| header.channels.list.len()).sum();
-    limit("number of channels", channels as u64, limits::EXR_CHANNELS_MAX as u64)?;
-    let mut bytes = 0u64;
+    limit(
+        path,
+        "number of channels",
+        channels as u64,
+        limits::EXR_CHANNELS_MAX as u64,
+    )?;
     for header in headers {
         let pixels = header.layer_size.width() as u64 * header.layer_size.height() as u64;
-        limit("number of pixels", pixels, IMAGE_PIXELS_MAX)?;
-        bytes += pixels * header.channels.bytes_per_pixel as u64;
-        limit("size of the pixels in bytes", bytes, limits::EXR_BYTES_MAX)?;
+        limit(path, "number of pixels", pixels, IMAGE_PIXELS_MAX)?;
         let block = header.max_block_byte_size() as u64;
-        limit("size of a block in bytes", block, limits::EXR_BLOCK_BYTES_MAX)?;
+        limit(path, "size of a block in bytes", block, limits::EXR_BLOCK_BYTES_MAX)?;
     }
-    if headers.is_empty() || channels == 0 {
+    if channels == 0 {
         return Err(PointsError::invalid(path, "the image has no channels"));
     }
     Ok(())
+}
+
+fn limit(path: &Path, what: &'static str, value: u64, limit: u64) -> Result<(), PointsError> {
+    if value <= limit {
+        return Ok(());
+    }
+    Err(PointsError::Limit {
+        what,
+        value,
+        limit,
+        path: path.to_owned(),
+    })
+}
+
+fn part_window(header: &Header) -> Window {
+    window(&IntegerBounds {
+        position: header.own_attributes.layer_position,
+        size: header.layer_size,
+    })
 }
 
 fn window(bounds: &IntegerBounds) -> Window {

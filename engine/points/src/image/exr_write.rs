@@ -1,13 +1,17 @@
-//! [`LayeredImage`] to EXR: one part, tiled, ZIP.
+//! [`LayeredImage`] to EXR: one part, tiled, ZIP. Blocks are made from the channels as they are; nothing is copied whole.
 
-use super::{LayeredImage, Precision, Window};
+use super::{Channel, LayeredImage, Precision, Window};
 use crate::error::PointsError;
 use crate::limits;
 use crate::output::write_file;
-use exr::meta::attribute::{AttributeValue, IntegerBounds, Text};
+use exr::block::lines::LineRefMut;
+use exr::block::{BlockIndex, UncompressedBlock};
+use exr::image::write::channels::{ChannelsWriter, WritableChannels};
+use exr::math::RoundingMode;
+use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, IntegerBounds, LevelMode, Text};
+use exr::meta::header::Header;
 use exr::prelude::{
-    AnyChannel, AnyChannels, Blocks, Compression, Encoding, FlatSamples, Image, ImageAttributes, Layer,
-    LayerAttributes, LineOrder, Vec2, WritableImage,
+    Blocks, Compression, Encoding, Image, Layer, LayerAttributes, LineOrder, SampleType, Vec2, WritableImage,
 };
 use half::f16;
 use std::path::Path;
@@ -23,25 +27,27 @@ impl LayeredImage {
         write_file(path, |file| image.write().non_parallel().to_buffered(file))
     }
 
-    fn to_exr(&self, path: &Path) -> Result<Image<Layer<AnyChannels<FlatSamples>>>, PointsError> {
+    fn to_exr(&self, path: &Path) -> Result<Image<Layer<Planes<'_>>>, PointsError> {
         let text = |value: &str| {
             Text::new_or_none(value).ok_or_else(|| {
                 PointsError::invalid(path, format!("{value:?} has characters that an EXR text cannot hold"))
             })
         };
-        let mut channels = Vec::with_capacity(self.channels.len());
+        let mut planes = Vec::with_capacity(self.channels.len());
         for (name, channel) in &self.channels {
-            let samples = match channel.precision {
-                Precision::Half => FlatSamples::F16(channel.values.iter().copied().map(f16::from_f32).collect()),
-                Precision::Float => FlatSamples::F32(channel.values.clone()),
-            };
-            channels.push(AnyChannel::new(text(name)?, samples));
+            planes.push((text(name)?, channel));
         }
+        let planes = Planes {
+            width: self.data_window.width as usize,
+            planes,
+        };
+        let (image, kept) = self.attributes.for_file(bounds(self.display_window));
         let mut attributes = LayerAttributes {
             layer_position: Vec2(self.data_window.x, self.data_window.y),
             software_name: Text::new_or_none(concat!("pbgi ", env!("CARGO_PKG_VERSION"))),
             world_to_camera: self.world_to_camera.map(|matrix| matrix.to_cols_array()),
-            ..LayerAttributes::default()
+            world_to_normalized_device: self.world_to_ndc.map(|matrix| matrix.to_cols_array()),
+            ..kept
         };
         for (key, value) in &self.metadata {
             attributes.other.insert(text(key)?, AttributeValue::Text(text(value)?));
@@ -52,8 +58,55 @@ impl LayeredImage {
             blocks: Blocks::Tiles(Vec2(limits::EXR_TILE_EDGE, limits::EXR_TILE_EDGE)),
             line_order: LineOrder::Increasing,
         };
-        let layer = Layer::new(size, attributes, encoding, AnyChannels::sort(channels.into()));
-        Ok(Image::new(ImageAttributes::new(bounds(self.display_window)), layer))
+        Ok(Image::new(image, Layer::new(size, attributes, encoding, planes)))
+    }
+}
+
+/// The channels in the order of their names, which the format asks for.
+struct Planes<'a> {
+    width: usize,
+    planes: Vec<(Text, &'a Channel)>,
+}
+
+impl<'a, 'channels: 'a> WritableChannels<'a> for Planes<'channels> {
+    type Writer = &'a Self;
+
+    fn infer_channel_list(&self) -> ChannelList {
+        let describe = |(name, channel): &(Text, &Channel)| {
+            let sample_type = match channel.precision {
+                Precision::Half => SampleType::F16,
+                Precision::Float => SampleType::F32,
+            };
+            ChannelDescription::named(name.clone(), sample_type)
+        };
+        ChannelList::new(self.planes.iter().map(describe).collect())
+    }
+
+    fn infer_level_modes(&self) -> (LevelMode, RoundingMode) {
+        (LevelMode::Singular, RoundingMode::Down)
+    }
+
+    fn create_writer(&'a self, _: &Header) -> Self::Writer {
+        self
+    }
+}
+
+impl ChannelsWriter for &Planes<'_> {
+    fn extract_uncompressed_block(&self, header: &Header, block: BlockIndex) -> Vec<u8> {
+        UncompressedBlock::collect_block_data_from_lines(&header.channels, block, |line| self.extract_line(line))
+    }
+}
+
+impl Planes<'_> {
+    fn extract_line(&self, line: LineRefMut<'_>) {
+        let (_, channel) = &self.planes[line.location.channel];
+        let start = line.location.position.y() * self.width + line.location.position.x();
+        let row = &channel.values[start..start + line.location.sample_count];
+        let written = match channel.precision {
+            Precision::Half => line.write_samples(|index| f16::from_f32(row[index])),
+            Precision::Float => line.write_samples_from_slice(row),
+        };
+        debug_assert!(written.is_ok(), "a line holds its samples");
     }
 }
 

@@ -1,19 +1,24 @@
-//! Pictures of named channels: [`LayeredImage`] and its EXR form, [`write_png`], [`read_environment`].
+//! Pictures of named channels: [`LayeredImage`] and its EXR form, [`write_png`], [`Difference`], [`read_environment`].
 
+mod attributes;
+mod difference;
 mod environment;
 mod exr_read;
 mod exr_write;
 mod png;
 
+pub use attributes::Attributes;
+pub use difference::{Difference, LayerDifference, SHARE_LEVELS};
 pub use environment::read_environment;
-pub(crate) use exr_read::channel_names;
-pub use png::{ToneMap, write_png};
+pub(crate) use exr_read::{Contents, contents, read};
+pub use png::{ToneMap, tone_mapped, write_heat_png, write_png};
 
 use glam::Mat4;
+use serde::Serialize;
 use std::collections::BTreeMap;
 
 /// A rectangle of pixels on the plane of an EXR file: x to the right, y down.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Window {
     /// Leftmost column.
     pub x: i32,
@@ -69,10 +74,15 @@ pub struct LayeredImage {
     pub display_window: Window,
     /// Every channel has `data_window.pixel_count()` values.
     pub channels: BTreeMap<String, Channel>,
-    /// String attributes, ours under `pbgi/...`.
+    /// String attributes that no standard names, ours under `pbgi/...`.
     pub metadata: BTreeMap<String, String>,
     /// The standard attribute `worldToCamera`: column vectors, left-handed camera space with +z along the view.
     pub world_to_camera: Option<Mat4>,
+    /// The standard attribute `worldToNDC`: column vectors; (0, 0) is the upper left, (1, 1) the lower right corner of the
+    /// display window.
+    pub world_to_ndc: Option<Mat4>,
+    /// What else a file said of itself.
+    pub attributes: Attributes,
 }
 
 impl LayeredImage {
@@ -90,6 +100,8 @@ impl LayeredImage {
             channels: BTreeMap::new(),
             metadata: BTreeMap::new(),
             world_to_camera: None,
+            world_to_ndc: None,
+            attributes: Attributes::default(),
         }
     }
 

@@ -54,6 +54,8 @@ pub(super) struct Header {
     pub(super) elements: Vec<Element>,
     /// Bytes of the header, where the data start.
     pub(super) bytes: u64,
+    /// The lines as they are.
+    pub(super) text: String,
     /// The box that a file of ours declares in a comment.
     pub(super) bounds: Option<Bounds>,
 }
@@ -152,6 +154,7 @@ impl Header {
             encoding: Encoding::Ascii,
             elements: Vec::new(),
             bytes: 0,
+            text: String::new(),
             bounds: None,
         };
         let mut limited = reader.take(limits::PLY_HEADER_BYTES_MAX);
@@ -169,6 +172,7 @@ impl Header {
                 return Err(PointsError::invalid(path, what));
             }
             let line = String::from_utf8_lossy(&line);
+            header.text.push_str(&line);
             let words: Vec<&str> = line.split_whitespace().collect();
             if number == 1 && words != ["ply"] {
                 return Err(PointsError::invalid(

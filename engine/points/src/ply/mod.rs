@@ -1,4 +1,4 @@
-//! PLY point clouds, ASCII and binary, in and out, a batch at a time.
+//! PLY point clouds, ASCII and binary, in and out, a batch at a time; PLY meshes, whole.
 //!
 //! Properties of `vertex`: `x y z`, `nx ny nz`, `radius`, `red green blue` for the radiance of the front and
 //! `back_red back_green back_blue` for the back. Floating-point colours are linear radiance; whole numbers are sRGB, decoded
@@ -7,10 +7,13 @@
 //! Files of ours name the exact box of their points in a comment (`pbgi-bounds`, six numbers), so that a build reads them
 //! once. They come in two forms: floats that any tool understands, and [`PlyForm::Records`], which a build takes as they are.
 
+mod copy;
 mod header;
+pub(crate) mod mesh;
 mod read;
 mod write;
 
+pub(crate) use copy::copy_ply;
 pub use read::PlyPoints;
 pub use write::{PlyForm, PlyWriter, write_point_ply};
 

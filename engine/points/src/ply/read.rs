@@ -16,20 +16,21 @@ use std::path::{Path, PathBuf};
 /// A PLY file as a stream of points.
 pub struct PlyPoints {
     path: PathBuf,
-    reader: BufReader<File>,
-    encoding: Encoding,
+    pub(super) reader: BufReader<File>,
+    pub(super) encoding: Encoding,
     /// Elements that lie before the vertices.
     before: Vec<Element>,
-    vertex: Element,
+    pub(super) vertex: Element,
     form: Form,
-    data_start: u64,
+    pub(super) data_start: u64,
+    pub(super) header_text: String,
     /// The box that our own writer declares.
     declared: Option<Bounds>,
     origin: [f64; 3],
     /// Whether the reader stands at the next point.
     positioned: bool,
     door: Door,
-    buffer: Vec<u8>,
+    pub(super) buffer: Vec<u8>,
     values: Vec<f64>,
 }
 
@@ -112,6 +113,7 @@ impl PlyPoints {
             encoding: header.encoding,
             before,
             data_start: header.bytes,
+            header_text: header.text,
             declared: header.bounds.filter(|_| !options.recompute_bounds).map(moved),
             origin,
             positioned: false,
@@ -125,6 +127,19 @@ impl PlyPoints {
     /// Number of points.
     pub fn point_count(&self) -> u64 {
         self.vertex.count
+    }
+
+    /// Whether they are records of ours, byte for byte.
+    pub(crate) fn holds_records(&self) -> bool {
+        matches!(self.form, Form::Records)
+    }
+
+    /// Goes to the first point; which byte of the file it starts at.
+    pub(super) fn vertices_start(&mut self) -> Result<u64, PointsError> {
+        self.skip_to_vertices()?;
+        self.reader
+            .stream_position()
+            .map_err(PointsError::io("read", &self.path))
     }
 
     fn skip_to_vertices(&mut self) -> Result<(), PointsError> {
@@ -166,7 +181,7 @@ impl PlyPoints {
     }
 
     /// The next line that is not blank, into `buffer`.
-    fn read_line(&mut self) -> Result<(), PointsError> {
+    pub(super) fn read_line(&mut self) -> Result<(), PointsError> {
         loop {
             self.buffer.clear();
             let most = limits::PLY_LINE_BYTES_MAX as u64;
@@ -323,6 +338,10 @@ impl Cloud for PlyPoints {
 
     fn skipped(&self) -> u64 {
         self.door.skipped()
+    }
+
+    fn number(&mut self) {
+        self.door.number();
     }
 }
 

@@ -87,6 +87,7 @@ pub fn build(points: &[PointRecord]) -> (SceneInfo, ArraySource) {
         bounds: None,
         quantizer: None,
         radius_max: points.iter().map(|point| point.radius).fold(0.0, f32::max),
+        origin: [0.0; 3],
         settings,
     };
     let Some(quantizer) = Quantizer::from_bounds(&bounds) else {

@@ -48,6 +48,7 @@ pub(crate) fn info(points: u32, nodes: u32, slots: u64, build_id: u128) -> Scene
         bounds: filled.then_some(bounds),
         quantizer: filled.then(|| Quantizer::from_bounds(&bounds).unwrap()),
         radius_max: if filled { 0.5 } else { 0.0 },
+        origin: [0.0; 3],
         settings: settings(),
     }
 }

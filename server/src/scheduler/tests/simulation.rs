@@ -2,6 +2,8 @@
 //! daemon that is killed and comes back with what it had stored. Every history comes from a seed.
 
 use super::*;
+use crate::telemetry::{SHIFT_MILLIS, unix_millis};
+use std::path::Path;
 
 /// SplitMix64.
 struct Random(u64);
@@ -57,6 +59,9 @@ struct World {
     paused: BTreeSet<JobNo>,
     restarts: u32,
     calm: bool,
+    /// What the scheduler said, and when by the wall clock, if that is kept.
+    log: Vec<(String, i64)>,
+    logged: bool,
 }
 
 impl World {
@@ -79,6 +84,8 @@ impl World {
             paused: BTreeSet::new(),
             restarts: 0,
             calm: false,
+            log: Vec::new(),
+            logged: false,
             random,
         }
     }
@@ -87,6 +94,9 @@ impl World {
         let effects = self.scheduler.on(event, self.now);
         for effect in &effects {
             self.check(effect);
+            if self.logged {
+                self.log.push((format!("{effect:?}"), unix_millis()));
+            }
         }
         effects
     }
@@ -365,5 +375,58 @@ fn no_tile_is_lost_none_counted_twice_and_every_job_ends() {
     );
     println!(
         "RELIABILITY R9: {seeds_run} seeds, {ended} jobs, {restarts} killed daemons: no tile lost, none twice, every job ended"
+    );
+}
+
+/// One history, with a wall clock that jumps by up to a day either way after every step if it is said to.
+fn history(seed: u64, wall_jumps: bool) -> Vec<(String, i64)> {
+    const DAY_MILLIS: i64 = 86_400_000;
+    let (mut world, mut jumps) = (World::new(seed), Random(seed));
+    world.logged = true;
+    for _ in 0..300 {
+        world.step();
+        if wall_jumps {
+            SHIFT_MILLIS.set(jumps.below(2 * DAY_MILLIS as u64) as i64 - DAY_MILLIS);
+        }
+    }
+    SHIFT_MILLIS.set(0);
+    world.log
+}
+
+#[test]
+fn jumps_of_the_wall_clock_change_nothing_that_is_decided() {
+    const SEEDS: u64 = 200;
+    let (mut effects, mut widest) = (0, 0);
+    for seed in 0..SEEDS {
+        let (calm, jumping) = (history(seed, false), history(seed, true));
+        let said = |log: &[(String, i64)]| log.iter().map(|(effect, _)| effect.clone()).collect::<Vec<_>>();
+        assert_eq!(said(&calm), said(&jumping), "PBGI_SEED={seed}");
+        effects += calm.len();
+        let jump = |pair: &[(String, i64)]| (pair[1].1 - pair[0].1).abs();
+        widest = widest.max(jumping.windows(2).map(jump).max().unwrap_or(0));
+    }
+    assert!(widest > 86_400_000, "the clock jumped by {widest} ms only");
+    // Nobody else asks what time it is; clippy forbids it to all but one module.
+    let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut readers = Vec::new();
+    let mut folders = vec![sources];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap().flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.file_name() != Path::new(file!()).file_name() {
+                let text = std::fs::read_to_string(&path).unwrap();
+                readers.extend(
+                    text.contains("SystemTime")
+                        .then(|| path.file_name().unwrap().to_owned()),
+                );
+            }
+        }
+    }
+    assert_eq!(readers, ["telemetry.rs"]);
+    println!(
+        "RELIABILITY O1: {SEEDS} histories with a wall clock that jumps by up to {:.0} h: the same {effects} effects as without",
+        widest as f64 / 3.6e6
     );
 }
