@@ -131,7 +131,7 @@ pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), 
     };
     let job = ShadeJob {
         settings: args.quality.settings()?,
-        scene: files::input(&args.scene)?,
+        scene: args.job.scene(&args.scene)?,
         gbuffer,
         passes: args.passes.options(),
         output: files::output_of_kind(&args.output.output, existing, "exr")?,

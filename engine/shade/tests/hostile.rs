@@ -214,3 +214,47 @@ fn millions_of_points_at_one_place_are_one_cluster_to_a_shading_call() {
         many.0, many.1, many.2
     );
 }
+
+#[test]
+fn receivers_on_points_and_inside_of_clusters_get_finite_light() {
+    let mut points = vec![];
+    support::quad(
+        Vec3::new(-1.0, 0.0, -1.0),
+        Vec3::Z * 2.0,
+        Vec3::X * 2.0,
+        24,
+        1.0,
+        &mut points,
+    );
+    support::sphere(Vec3::new(0.0, 0.8, 0.0), 0.4, 600, 2.0, &mut points);
+    let (info, mut source) = support::build(&points);
+    let mut shader = Shader::new(&info, settings(0.05), None).unwrap();
+    let (mut seed, mut shaded) = (1, 0);
+    for round in 0..24 {
+        // On the points themselves, then ever closer to them: 10^-1 to 10^-6.
+        let distance = if round < 8 { 0.0 } else { 0.1_f32.powi(round / 3 - 1) };
+        let near = |point: &PointRecord| {
+            let mut axis = || (random(&mut seed) >> 40) as f32 / (1 << 23) as f32 - 1.0;
+            let (aside, normal) = (Vec3::new(axis(), axis(), axis()), Vec3::new(axis(), axis(), axis()));
+            Receiver {
+                position: Vec3::from(point.position) + aside * distance,
+                normal: normal.try_normalize().unwrap_or(Vec3::Y),
+            }
+        };
+        let receivers: Vec<Receiver> = points.iter().map(near).collect();
+        for group in receivers.chunks(64) {
+            let mut out = vec![Shaded::default(); group.len()];
+            shader.shade_group(group, &mut source, &mut out).unwrap();
+            for (receiver, shaded) in group.iter().zip(&out) {
+                let light = shaded.irradiance.iter().all(|value| value.is_finite() && *value >= 0.0);
+                let open = shaded.bent_normal.iter().all(|value| value.is_finite());
+                let covered = (0.0..=1.0).contains(&shaded.occlusion);
+                assert!(light && open && covered, "{receiver:?}: {shaded:?}");
+            }
+        }
+        shaded += receivers.len();
+    }
+    println!(
+        "RELIABILITY D13: {shaded} receivers on points and 10^-1 to 10^-6 beside them: all values finite, none negative"
+    );
+}
