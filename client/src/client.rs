@@ -11,6 +11,7 @@ use pbgi_proto::v1;
 use pbgi_proto::v1::daemon_service_client::DaemonServiceClient;
 use pbgi_proto::v1::job_service_client::JobServiceClient;
 use pbgi_proto::v1::scene_service_client::SceneServiceClient;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::net::UnixStream;
@@ -28,6 +29,20 @@ const SCENE_SECS: u64 = 120;
 const SHUTDOWN_SECS: u64 = 60;
 /// A list of ten thousand jobs stays below this.
 pub(crate) const RESPONSE_BYTES_MAX: usize = 32 << 20;
+
+/// Connects to a socket. One whose queue is full, because many connect at once, is asked again for a while.
+async fn reach(socket: &Path) -> std::io::Result<UnixStream> {
+    const PAUSE: Duration = Duration::from_millis(10);
+    let deadline = tokio::time::Instant::now() + Duration::from_secs(CONNECT_SECS);
+    loop {
+        match UnixStream::connect(socket).await {
+            Err(error) if error.kind() == ErrorKind::WouldBlock && tokio::time::Instant::now() < deadline => {
+                tokio::time::sleep(PAUSE).await;
+            }
+            outcome => return outcome,
+        }
+    }
+}
 
 /// A connection to one daemon. Cheap to clone; clones share the connection.
 #[derive(Clone, Debug)]
@@ -56,13 +71,11 @@ impl Client {
             reason,
         };
         // The transport's own error says "transport error" only: ask the socket first.
-        UnixStream::connect(socket)
-            .await
-            .map_err(|error| unreachable(error.to_string()))?;
+        reach(socket).await.map_err(|error| unreachable(error.to_string()))?;
         let path = socket.to_owned();
         let connector = tower::service_fn(move |_| {
             let path = path.clone();
-            async move { UnixStream::connect(path).await.map(TokioIo::new) }
+            async move { reach(&path).await.map(TokioIo::new) }
         });
         // The authority is a formality: the connector knows where to go.
         let channel = Endpoint::from_static("http://localhost")
@@ -103,7 +116,7 @@ impl Client {
                 let header = format!("Bearer {}", token.trim()).parse::<MetadataValue<Ascii>>();
                 Some(header.map_err(|_| unreachable("the token is no plain text".to_owned()))?)
             }
-            Err(ClientError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => None,
+            Err(ClientError::Io { source, .. }) if source.kind() == ErrorKind::NotFound => None,
             Err(error) => return Err(error),
         };
         let endpoint = Endpoint::from_shared(uri.to_owned()).map_err(|_| ClientError::Address(uri.to_owned()))?;

@@ -171,6 +171,7 @@ impl ServeArguments {
                 .or(file.points_per_page.map(small))
                 .unwrap_or(POINTS_PER_PAGE_DEFAULT),
             access: file.access.clone(),
+            otlp: file.otlp.clone(),
             config_file: self.config.as_deref().map(absolute).transpose()?,
         })
     }

@@ -36,6 +36,8 @@ pub struct Options {
     pub points_per_page: u32,
     /// Who may call, and what they may name.
     pub access: Access,
+    /// The collector that spans go to, `http://HOST:PORT`.
+    pub otlp: Option<String>,
     /// The file that said so, if there is one.
     pub config_file: Option<PathBuf>,
 }
@@ -55,6 +57,7 @@ impl Options {
             nodes_per_page: NODES_PER_PAGE_DEFAULT,
             points_per_page: POINTS_PER_PAGE_DEFAULT,
             access: Access::default(),
+            otlp: None,
             config_file: None,
         }
     }
@@ -115,6 +118,7 @@ impl Options {
         );
         note(self.access.group != new.access.group, &mut left, "group");
         note(self.access.http != new.access.http, &mut left, "http");
+        note(self.otlp != new.otlp, &mut left, "otlp");
         self.idle = new.idle;
         self.access.users.clone_from(&new.access.users);
         self.access.roots.clone_from(&new.access.roots);
@@ -255,6 +259,7 @@ impl Config {
                 .http
                 .map(|address| format!("page and metrics also: http://{address}/")),
         );
+        lines.extend(options.otlp.as_ref().map(|endpoint| format!("spans go to: {endpoint}")));
         lines.extend(
             options
                 .idle

@@ -31,6 +31,8 @@ pub struct ConfigFile {
     pub log: Option<String>,
     /// `text` or `json`.
     pub log_format: Option<String>,
+    /// The collector that spans go to, `http://HOST:PORT`.
+    pub otlp: Option<String>,
     /// Who may do what.
     pub access: Access,
 }
@@ -63,6 +65,7 @@ impl ConfigFile {
                 let format = value.as_str()?;
                 ["text", "json"].contains(&format).then(|| format.to_owned())
             }),
+            otlp: None,
             access: Access::default(),
         };
         let users = file.read("allow_users", "a list of user names and numbers", |value| {
@@ -71,12 +74,14 @@ impl ConfigFile {
         config.access.users = users.unwrap_or_default();
         config.access.group = file.read("group", "a group that exists", group);
         let (roots, tcp, http) = (file.section("roots"), file.section("tcp"), file.section("http"));
+        let otlp = file.section("otlp");
         file.end();
         for (name, value) in roots.unwrap_or_default() {
             config.root(&name, value, &mut problems);
         }
         config.access.tcp = tcp.and_then(|table| read_tcp(table, &mut problems));
         config.access.http = http.and_then(|table| read_http(table, &mut problems));
+        config.otlp = otlp.and_then(|table| read_otlp(table, &mut problems));
         config.check_together(&mut problems);
         if problems.is_empty() { Ok(config) } else { Err(problems) }
     }
@@ -197,6 +202,20 @@ fn read_token(name: &str, value: Value, problems: &mut Vec<String>) -> Option<To
             None
         }
     }
+}
+
+fn read_otlp(table: Table, problems: &mut Vec<String>) -> Option<String> {
+    let mut section = Section::new("otlp.", table, problems);
+    let endpoint = section.read("endpoint", "a collector like \"http://127.0.0.1:4317\"", |value| {
+        let endpoint = value.as_str()?;
+        let host = endpoint.strip_prefix("http://")?;
+        (!host.is_empty()).then(|| endpoint.to_owned())
+    });
+    section.end();
+    if !cfg!(feature = "otlp") {
+        problems.push("otlp needs a pbgi-server that was built with --features otlp".to_owned());
+    }
+    endpoint
 }
 
 fn read_http(table: Table, problems: &mut Vec<String>) -> Option<SocketAddr> {
@@ -384,6 +403,8 @@ mod tests {
             auth = "DANGEROUSLY_INSECURE"
             [http]
             address = "1.2.3.4:80"
+            [otlp]
+            endpoint = "127.0.0.1:4317"
         "#;
         let problems = ConfigFile::parse(text).unwrap_err();
         for part in [
@@ -396,6 +417,7 @@ mod tests {
             "roots.b.path is missing",
             "tcp.address must be loopback",
             "http.address must be loopback",
+            "otlp.endpoint is \"127.0.0.1:4317\", must be a collector like",
         ] {
             assert!(
                 problems.iter().any(|problem| problem.contains(part)),

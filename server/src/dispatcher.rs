@@ -353,6 +353,7 @@ impl Dispatcher {
                 status.note("suspended: the daemon stopped");
             });
             self.save(job, record);
+            record.span = Span::none();
             return;
         }
         state.outputs.remove(record.request.output());
@@ -382,6 +383,8 @@ impl Dispatcher {
             (status.state, status.error) = (job_state, error);
         });
         self.save(job, record);
+        // The span ends with the job, though the record stays.
+        record.span = Span::none();
         *state.totals.ended.entry(job_state).or_default() += 1;
         self.retire(state, job, job_state);
     }

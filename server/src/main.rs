@@ -2,6 +2,8 @@
 #![forbid(unsafe_code)]
 
 mod cli;
+#[cfg(feature = "otlp")]
+mod otlp;
 mod process;
 
 use clap::{CommandFactory, Parser};
@@ -88,7 +90,6 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
     if arguments.private {
         process::log_to(&config.options.log_file())?;
     }
-    let log = init_tracing(arguments, &file)?;
     abort_on_core_panic();
     process::prefer_to_live();
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -99,6 +100,9 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
             action: "start the runtime",
             reason: error.to_string(),
         })?;
+    let within = runtime.enter();
+    let (log, traces) = init_tracing(arguments, &file, &config)?;
+    drop(within);
     let outcome = runtime.block_on(async {
         let listeners = Listeners::bind(&config, activated)?;
         process::make_outputs_readable();
@@ -115,6 +119,7 @@ fn serve_until_stopped(arguments: &ServeArguments) -> Result<(), ServerError> {
         };
         pbgi_server::run(config, state, listeners, tell, orders).await
     });
+    traces.finish();
     // Blocking tasks that still run belong to jobs that are given up.
     runtime.shutdown_background();
     outcome
@@ -166,15 +171,44 @@ fn log_filter(text: &str) -> Result<EnvFilter, ServerError> {
     })
 }
 
-fn init_tracing(arguments: &ServeArguments, file: &ConfigFile) -> Result<LogHandle, ServerError> {
+/// Where spans go.
+struct Traces {
+    #[cfg(feature = "otlp")]
+    collector: Option<otlp::Traces>,
+}
+
+impl Traces {
+    /// Sends what is left.
+    fn finish(&self) {
+        #[cfg(feature = "otlp")]
+        self.collector.iter().for_each(otlp::Traces::finish);
+    }
+}
+
+fn init_tracing(
+    arguments: &ServeArguments,
+    file: &ConfigFile,
+    config: &Config,
+) -> Result<(LogHandle, Traces), ServerError> {
+    // A configuration with a collector is refused by a program without the feature.
+    debug_assert!(cfg!(feature = "otlp") || config.options.otlp.is_none());
     let (filter, handle) = reload::Layer::new(log_filter(arguments.log(file))?);
     let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
     let lines = match arguments.log_format(file) {
         LogFormat::Text => lines.with_ansi(false).boxed(),
         LogFormat::Json => lines.json().boxed(),
     };
-    tracing_subscriber::registry().with(filter).with(lines).init();
-    Ok(handle)
+    let subscriber = tracing_subscriber::registry().with(lines.with_filter(filter));
+    #[cfg(feature = "otlp")]
+    let collector = config.options.otlp.as_deref().map(otlp::Traces::start).transpose()?;
+    #[cfg(feature = "otlp")]
+    let subscriber = subscriber.with(collector.as_ref().map(otlp::Traces::layer));
+    subscriber.init();
+    let traces = Traces {
+        #[cfg(feature = "otlp")]
+        collector,
+    };
+    Ok((handle, traces))
 }
 
 /// Reads the configuration file again and takes over what is logged; the rest is the daemon's.

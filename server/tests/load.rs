@@ -162,7 +162,7 @@ async fn load_of_ten_thousand_jobs_and_slow_readers_is_carried() {
 #[tokio::test]
 #[ignore = "minutes: thousands of jobs, one after the other"]
 async fn soak_leaves_memory_descriptors_and_processes_as_they_were() {
-    let jobs: usize = std::env::var("PBGI_SOAK_JOBS").map_or(4_000, |text| text.parse().unwrap());
+    let jobs: usize = std::env::var("PBGI_SOAK_JOBS").map_or(10_000, |text| text.parse().unwrap());
     let site = Site::new(32, 32);
     let pid = site.daemon.child.id();
     site.succeed("build", site.build("s.pbgi")).await;

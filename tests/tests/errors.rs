@@ -230,6 +230,7 @@ fn memory_that_is_not_there_is_refused_with_both_numbers() {
     refused(&house, &shade("16M"), &["memory", "--memory"]);
     // The one daemon that runs is the one that made the scene.
     assert_eq!(house.running("pbgi-server").len(), 1);
+    println!("RELIABILITY S3: 8000G and 16M refused, no daemon started");
 }
 
 #[test]
@@ -265,6 +266,7 @@ fn small_dev_shm_is_an_error_and_not_a_signal() {
         assert_eq!(run.stdout.trim(), "", "a segment is left in /dev/shm");
         assert_empty(&house.path("out"));
     }
+    println!("RELIABILITY S2: a tmpfs of 16 MiB: 2 errors with the bytes needed, 0 signals, 0 segments left");
 }
 
 #[test]

@@ -63,7 +63,7 @@ class Daemon:
 
     def stop(self) -> None:
         self.process.terminate()
-        assert self.process.wait(20) == 0, (self.folder / "log").read_text()
+        assert self.process.wait(60) == 0, (self.folder / "log").read_text()
         self.process.stdout.close()
         shutil.rmtree(self.folder)
 

@@ -8,7 +8,7 @@ use pbgi_client::private::PrivateOptions;
 use pbgi_client::size::parse_bytes;
 use pbgi_core::{BuildSettings, ShadeSettings, limits};
 use pbgi_points::{CloudOptions, Density, Facing, GBufferOptions, InvalidPoints, Radius, Space, ViewDensity};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Which daemon.
 #[derive(Args, Debug, Default)]
@@ -466,6 +466,14 @@ pub(crate) struct JobArgs {
 }
 
 impl JobArgs {
+    /// A scene to shade: a job that comes after others may take what these make.
+    pub(crate) fn scene(&self, path: &Path) -> Result<PathBuf, Failure> {
+        match self.after.as_slice() {
+            [] => files::input(path),
+            _ => files::input_to_come(path),
+        }
+    }
+
     pub(crate) fn options(&self) -> JobOptions {
         JobOptions {
             user: self.user.clone().unwrap_or_default(),

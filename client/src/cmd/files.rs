@@ -39,6 +39,18 @@ pub(crate) fn inputs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
     paths.iter().map(|path| input(path)).collect()
 }
 
+/// An input that is there, or that a job before this one makes: then its folder is there.
+pub(crate) fn input_to_come(path: &Path) -> Result<PathBuf, Failure> {
+    let there = input(path);
+    match (path.parent(), path.file_name()) {
+        (Some(folder), Some(name)) if there.is_err() && fs::symlink_metadata(path).is_err() => {
+            let here = folder.as_os_str().is_empty();
+            Ok(input(if here { Path::new(".") } else { folder })?.join(name))
+        }
+        _ => there,
+    }
+}
+
 /// What happens to an output that is there already.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Existing {
@@ -138,6 +150,17 @@ mod tests {
         fs::write(&here, "").unwrap();
         assert_eq!(input(&here).unwrap(), here.canonicalize().unwrap());
         assert!(input(Path::new("./none:there")).is_err());
+    }
+
+    #[test]
+    fn scene_that_an_earlier_job_makes_need_not_be_there_but_its_folder_must() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().canonicalize().unwrap();
+        assert_eq!(input_to_come(&root.join("s.pbgi")).unwrap(), root.join("s.pbgi"));
+        assert!(input_to_come(Path::new("s.pbgi")).unwrap().is_absolute());
+        assert!(input_to_come(&root.join("none/s.pbgi")).is_err());
+        fs::write(root.join("s.pbgi"), "").unwrap();
+        assert_eq!(input_to_come(&root.join("s.pbgi")).unwrap(), root.join("s.pbgi"));
     }
 
     #[test]

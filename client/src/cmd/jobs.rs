@@ -131,7 +131,7 @@ pub(crate) async fn shade(args: ShadeArgs, interrupt: &Interrupt) -> Result<(), 
     };
     let job = ShadeJob {
         settings: args.quality.settings()?,
-        scene: files::input(&args.scene)?,
+        scene: args.job.scene(&args.scene)?,
         gbuffer,
         passes: args.passes.options(),
         output: files::output_of_kind(&args.output.output, existing, "exr")?,
@@ -248,7 +248,7 @@ pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Fa
         println!(
             "{:width$}  {:9}  {:>5}  {}",
             job.id,
-            job.state.name(),
+            standing(job),
             share(job),
             job.title
         );
@@ -268,9 +268,10 @@ fn in_full(job: &Job) -> String {
         ("task", job.title.clone()),
         (
             "state",
-            format!("{} {} {}", job.state.name(), job.stage, share(job))
-                .trim_end()
-                .to_owned(),
+            [standing(job), doing(job), &share(job)]
+                .join(" ")
+                .trim()
+                .replace("  ", " "),
         ),
         ("user", options.user.clone()),
         ("labels", labels.join(" ")),
@@ -302,6 +303,23 @@ fn utc(unix_millis: i64) -> String {
     let year = year + era * 400 + i64::from(month_number <= 2);
     let (hours, minutes, seconds) = (millis / 3_600_000, millis / 60_000 % 60, millis / 1_000 % 60);
     format!("{year:04}-{month_number:02}-{date:02}T{hours:02}:{minutes:02}:{seconds:02}Z")
+}
+
+/// Where a job is, in a word.
+fn standing(job: &Job) -> &str {
+    match job.stage.as_str() {
+        // It waits for somebody, not for its turn.
+        rest @ ("paused" | "pausing") => rest,
+        _ => job.state.name(),
+    }
+}
+
+/// What a running job does.
+fn doing(job: &Job) -> &str {
+    match job.state {
+        JobState::Running if standing(job) == job.state.name() => &job.stage,
+        _ => "",
+    }
 }
 
 /// How far a running job's stage is.
@@ -379,7 +397,7 @@ pub(crate) async fn pause(args: CancelArgs, interrupt: &Interrupt) -> Result<(),
         Ok(client.pause(&args.job, &args.reason).await?)
     });
     let job = job.await?;
-    println!("{} is {} {}", job.id, job.state.name(), job.stage);
+    println!("{} is {}", job.id, standing(&job));
     Ok(())
 }
 
@@ -399,7 +417,7 @@ pub(crate) async fn resume(args: JobNameArgs, interrupt: &Interrupt) -> Result<(
         Ok(client.resume(&args.job).await?)
     });
     let job = job.await?;
-    println!("{} is {} {}", job.id, job.state.name(), job.stage);
+    println!("{} is {}", job.id, standing(&job));
     Ok(())
 }
 
@@ -409,7 +427,7 @@ pub(crate) async fn retry(args: JobNameArgs, interrupt: &Interrupt) -> Result<()
         Ok(client.retry(&args.job).await?)
     });
     let job = job.await?;
-    println!("{} is {} {}", job.id, job.state.name(), job.stage);
+    println!("{} is {}", job.id, standing(&job));
     Ok(())
 }
 

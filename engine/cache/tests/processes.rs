@@ -413,6 +413,7 @@ fn worker_that_scribbles_on_its_ledger_is_named_and_evictions_resume_after_it() 
     });
     assert_eq!(owner.overrun(), None);
     assert_eq!(owner.counters().node.evictions, 1);
+    println!("RELIABILITY S6: all bits set: the worker named, the next eviction done once it was reaped");
 }
 
 #[test]
@@ -420,4 +421,5 @@ fn worker_of_another_build_is_refused() {
     let owner = owner(1, 16, 4, 2);
     let worker = start(&owner, 0, "hold", 0, owner.layout().hash() ^ 2);
     assert_eq!(end(worker).code(), Some(REFUSED));
+    println!("RELIABILITY S7: a layout of another build refused, exit code {REFUSED}");
 }

@@ -338,6 +338,7 @@ impl Dispatcher {
         state.failed.retain(|failed| *failed != job);
         if let Some(record) = state.jobs.get_mut(&job) {
             record.abort.send_replace(false);
+            record.span = span(&status);
             (record.kept.cancelled, record.kept.daemon_deaths) = (false, 0);
             record.status.send_modify(|status| {
                 (status.state, status.error) = (JobState::Queued, String::new());

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use tokio::sync::watch;
+use tracing::Span;
 
 /// What is kept of a job beside its status.
 #[derive(Clone, Debug, Default)]
@@ -156,7 +157,10 @@ impl Dispatcher {
         state.names.insert(status.id.clone(), job);
         let ended = status.state;
         let record = Record {
-            span: super::clients::span(&status),
+            span: match goes_on {
+                true => super::clients::span(&status),
+                false => Span::none(),
+            },
             request: Arc::new(request),
             kept: Kept {
                 wire,

@@ -126,6 +126,7 @@ fn more_points_or_nodes_than_an_index_counts_are_refused_before_it_wraps() {
         );
         assert!(place.leftovers(place.volume.as_ref()).is_empty());
     }
+    println!("RELIABILITY F11: with room for 1,000 records, point 1,001 and node 1,001 are refused");
 }
 
 #[test]
@@ -169,6 +170,7 @@ fn radiance_at_the_limit_is_counted() {
     points.push(point([0.0; 3]));
     let report = build_cloud(&Cloud::new(points), &place, &place.host(), small_pages()).unwrap();
     assert_eq!(report.radiance_clamped, 1);
+    println!("RELIABILITY D10: 1 radiance of 1e9 clamped and counted");
 }
 
 #[test]

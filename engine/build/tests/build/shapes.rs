@@ -17,6 +17,7 @@ fn no_points_make_a_valid_empty_scene() {
         max: [1.0; 3],
     });
     build_and_audit(&cloud, BuildSettings::default());
+    println!("RELIABILITY D8: 3 clouds without points, 3 valid scenes without nodes");
 }
 
 #[test]
@@ -29,6 +30,7 @@ fn up_to_sixteen_points_are_one_leaf_and_seventeen_are_divided() {
         let (tree, _) = build_and_audit(&corners(points), BuildSettings::default());
         assert_eq!(tree.node_count(), nodes, "{points} points");
     }
+    println!("RELIABILITY D9: 1, 8 and 16 points are 1 node, 17 are 9");
 }
 
 #[test]
@@ -44,6 +46,7 @@ fn a_million_equal_points_are_a_chain_with_one_overflow_leaf() {
         assert_eq!(tree.levels, [1; 22]);
         assert_eq!((tree.overflow_points, report.overflow_points), (1_000_000, 1_000_000));
     }
+    println!("RELIABILITY D2: 1,000,000 equal points: 22 nodes, one overflow leaf of 1,000,000");
 }
 
 #[test]
@@ -66,6 +69,7 @@ fn points_on_cell_corners_and_on_the_maximum_faces_are_all_kept() {
         .map(|i| point([i % 9, i / 9 % 9, i / 81].map(|v| v as f32 / 8.0)))
         .collect();
     build_and_audit(&Cloud::new(cube).bounded(), small_pages());
+    println!("RELIABILITY D6: 4,225 points on corners of cells and 729 on faces of a box, all of them kept");
 }
 
 #[test]
@@ -80,6 +84,7 @@ fn flat_and_linear_clouds_and_any_scale_build() {
             assert!(tree.node_count() > 30, "scale {scale}");
         }
     }
+    println!("RELIABILITY D4: lines and planes at 5 scales, 10 scenes whole");
 }
 
 #[test]
@@ -99,6 +104,7 @@ fn coordinates_and_radii_of_any_size_make_finite_nodes() {
             build_and_audit(&Cloud::new(tiny.collect()), small_pages());
         }
     }
+    println!("RELIABILITY D7: 5 scales of coordinates, 7 of radii, 40 scenes with finite nodes");
 }
 
 #[test]

@@ -105,6 +105,11 @@ fn leftovers_of_the_same_output_are_swept_and_nothing_else() {
     assert_eq!(left.len(), decoys.len() + 3, "{left:?}");
     drop(living);
     Scene::open(&path).unwrap();
+    println!(
+        "RELIABILITY F12: {} leftovers swept, {} others stay",
+        leftovers.len(),
+        decoys.len() + 2
+    );
 }
 
 #[test]

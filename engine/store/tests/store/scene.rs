@@ -95,6 +95,7 @@ fn every_truncation_or_extension_is_refused_naming_both_lengths() {
     }
     assert!(refused >= 200, "{refused}");
     Scene::open(&path).unwrap().verify().unwrap();
+    println!("RELIABILITY F4: {refused} lengths refused, both named");
 }
 
 #[test]
@@ -116,6 +117,10 @@ fn every_flipped_bit_is_detected() {
         }
         fs::write(&file, &whole).unwrap();
     }
+    println!(
+        "RELIABILITY F6: {} bits flipped, all of them detected",
+        400 * FILES.len()
+    );
 }
 
 #[test]
