@@ -284,3 +284,16 @@ fn a_picture_to_look_at_is_one_of_this_machine() {
     let text = fails(home.path(), 2, "shade s.pbgi --gbuffer g.exr -o o.exr --space sideways");
     assert!(text.contains("checked, world or camera"), "{text}");
 }
+
+#[test]
+fn a_reader_that_has_seen_enough_is_no_failure() {
+    let home = tempfile::tempdir().unwrap();
+    triangle(home.path());
+    let mut command = client(home.path());
+    command.args("sample t.gltf -o p.ply --points 100".split_whitespace());
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let output = command.stdout(writer).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && !text.contains("panicked"), "{text}");
+}

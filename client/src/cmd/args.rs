@@ -178,8 +178,11 @@ impl CloudArgs {
         }
     }
 
-    /// Tells where the world's origin is, if the files have it elsewhere.
+    /// Tells where the world's origin is, if the files have it elsewhere, and can be read here.
     pub(crate) fn say_origin(&self, inputs: &[PathBuf]) -> Result<(), Failure> {
+        if inputs.iter().any(|path| files::in_a_root(path)) {
+            return Ok(());
+        }
         let origin = pbgi_points::origin_of(inputs, &self.options())?;
         if origin != [0.0; 3] {
             let [x, y, z] = origin;
@@ -527,6 +530,13 @@ mod tests {
             (radius("auto"), radius("0.5")),
             (Ok(Radius::Estimate), Ok(Radius::Fixed(0.5)))
         );
+    }
+
+    #[test]
+    fn files_of_another_machine_are_not_looked_for_here() {
+        let args = CloudArgs::default();
+        assert!(args.say_origin(&["scans:a.ply".into(), "scans:b.laz".into()]).is_ok());
+        assert!(args.say_origin(&["/gone/b.laz".into()]).is_err());
     }
 
     #[test]

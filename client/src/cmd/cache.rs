@@ -1,5 +1,6 @@
 //! What the daemons' page caches hold: `cache`.
 
+use super::answer::say;
 use super::args::{FormArgs, RunningArgs};
 use super::failure::Failure;
 use super::interrupt::Interrupt;
@@ -35,11 +36,10 @@ pub(crate) async fn cache(args: CacheArgs, interrupt: &Interrupt) -> Result<(), 
     });
     let answers = answers.await?;
     if args.form.json {
-        println!("{}", at_address(&answers));
-        return Ok(());
+        return say(&at_address(&answers));
     }
     for (client, status) in answers {
-        print!("{}", describe(&client, &status));
+        say(&describe(&client, &status))?;
     }
     Ok(())
 }

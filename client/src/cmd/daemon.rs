@@ -1,5 +1,6 @@
 //! What a daemon tells of itself and of scenes: `info`, `status`, `shutdown`.
 
+use super::answer::say;
 use super::args::{FormArgs, RunningArgs, ServerArgs};
 use super::failure::Failure;
 use super::files;
@@ -36,11 +37,9 @@ pub(crate) async fn info(args: InfoArgs, interrupt: &Interrupt) -> Result<(), Fa
         interrupt.guard(asked).await?
     };
     if args.form.json {
-        println!("{}", pretty(&Described { info, shape }));
-        return Ok(());
+        return say(&pretty(&Described { info, shape }));
     }
-    print!("{}{}", describe(&info), histogram(&shape));
-    Ok(())
+    say(&(describe(&info) + &histogram(&shape)))
 }
 
 /// What `info --json` prints.
@@ -133,11 +132,10 @@ pub(crate) async fn status(args: StatusArgs, interrupt: &Interrupt) -> Result<()
     });
     let answers = answers.await?;
     if args.form.json {
-        println!("{}", at_address(&answers));
-        return Ok(());
+        return say(&at_address(&answers));
     }
     for (client, status) in answers {
-        print!("{}", describe_daemon(&client, &status));
+        say(&describe_daemon(&client, &status))?;
     }
     Ok(())
 }
@@ -202,7 +200,7 @@ pub(crate) async fn shutdown(args: ShutdownArgs, interrupt: &Interrupt) -> Resul
         Ok(stopped)
     });
     for client in stopped.await? {
-        println!("the daemon at {} is stopping", client.address());
+        say(&format!("the daemon at {} is stopping", client.address()))?;
     }
     Ok(())
 }

@@ -1,5 +1,6 @@
 //! `diff`: how far two pictures are apart.
 
+use super::answer::say;
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
@@ -124,9 +125,9 @@ fn run(args: &DiffArgs) -> Result<bool, Failure> {
             threshold: args.threshold,
             within_threshold: within,
         };
-        println!("{}", super::summary::pretty(&report));
+        say(&super::summary::pretty(&report))?;
     } else {
-        print!("{}", table(&difference));
+        say(&table(&difference))?;
     }
     Ok(within.unwrap_or(true))
 }

@@ -1,5 +1,6 @@
 //! `build`, `shade`, and what is done with jobs: `jobs`, `watch`, `cancel`.
 
+use super::answer::say;
 use super::args::{
     CloudArgs, DensityArgs, FormArgs, JobArgs, OctreeArgs, OutputArgs, PassArgs, QualityArgs, RunningArgs, SeenArgs,
     ServerArgs, StatsArgs,
@@ -198,8 +199,7 @@ async fn run(
         let submitted = session::submit(&client, &work, job.job_id.as_deref(), &options, &progress);
         let submitted = interrupt.guard(submitted).await?;
         if job.detach {
-            println!("{}", submitted.id);
-            return Ok(());
+            return say(&submitted.id);
         }
         session::follow(&client, &submitted.id, interrupt, &mut progress).await?
     };
@@ -222,11 +222,10 @@ pub(crate) struct ListArgs {
 pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Failure> {
     if let Some(id) = &args.job {
         let (_, job) = interrupt.guard(session::find_job(&args.running, id)).await?;
-        match args.form.json {
-            true => println!("{}", summary::pretty(&job)),
-            false => print!("{}", in_full(&job)),
-        }
-        return Ok(());
+        return say(&match args.form.json {
+            true => summary::pretty(&job),
+            false => in_full(&job),
+        });
     }
     let jobs = interrupt.guard(async {
         let mut jobs = Vec::new();
@@ -237,23 +236,22 @@ pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Fa
     });
     let jobs = jobs.await?;
     if args.form.json {
-        println!("{}", summary::pretty(&jobs));
-        return Ok(());
+        return say(&summary::pretty(&jobs));
     }
     if jobs.is_empty() {
         eprintln!("no jobs yet");
     }
     let width = jobs.iter().map(|job| job.id.len()).max().unwrap_or(0);
     for job in &jobs {
-        println!(
+        say(&format!(
             "{:width$}  {:9}  {:>5}  {}",
             job.id,
             standing(job),
             share(job),
             job.title
-        );
+        ))?;
         if job.state == JobState::Failed {
-            println!("{:width$}  {}", "", job.error);
+            say(&format!("{:width$}  {}", "", job.error))?;
         }
     }
     Ok(())
@@ -387,8 +385,7 @@ pub(crate) async fn cancel(args: CancelArgs, interrupt: &Interrupt) -> Result<()
     } else {
         "being cancelled"
     };
-    println!("{} is {state}", job.id);
-    Ok(())
+    say(&format!("{} is {state}", job.id))
 }
 
 pub(crate) async fn pause(args: CancelArgs, interrupt: &Interrupt) -> Result<(), Failure> {
@@ -397,8 +394,7 @@ pub(crate) async fn pause(args: CancelArgs, interrupt: &Interrupt) -> Result<(),
         Ok(client.pause(&args.job, &args.reason).await?)
     });
     let job = job.await?;
-    println!("{} is {}", job.id, standing(&job));
-    Ok(())
+    say(&format!("{} is {}", job.id, standing(&job)))
 }
 
 /// `resume` and `retry`
@@ -417,8 +413,7 @@ pub(crate) async fn resume(args: JobNameArgs, interrupt: &Interrupt) -> Result<(
         Ok(client.resume(&args.job).await?)
     });
     let job = job.await?;
-    println!("{} is {}", job.id, standing(&job));
-    Ok(())
+    say(&format!("{} is {}", job.id, standing(&job)))
 }
 
 pub(crate) async fn retry(args: JobNameArgs, interrupt: &Interrupt) -> Result<(), Failure> {
@@ -427,8 +422,7 @@ pub(crate) async fn retry(args: JobNameArgs, interrupt: &Interrupt) -> Result<()
         Ok(client.retry(&args.job).await?)
     });
     let job = job.await?;
-    println!("{} is {}", job.id, standing(&job));
-    Ok(())
+    say(&format!("{} is {}", job.id, standing(&job)))
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! The commands, one module each, and what they share: arguments, failures, files, progress, summaries.
 
+mod answer;
 mod args;
 mod cache;
 mod composite;

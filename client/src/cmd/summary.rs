@@ -1,5 +1,6 @@
 //! The statistics: a table for people, one flat JSON object for programs.
 
+use super::answer::say;
 use super::failure::Failure;
 use super::files;
 use pbgi_client::size::scaled_bytes;
@@ -10,7 +11,7 @@ use std::path::Path;
 
 /// Prints the table, and writes the file if one is asked for.
 pub(crate) fn report(statistics: &Statistics, file: Option<&Path>) -> Result<(), Failure> {
-    print!("{}", table(statistics));
+    say(&table(statistics))?;
     if let Some(text) = statistics.diagnosis() {
         eprintln!("note: {text}");
     }
