@@ -52,6 +52,7 @@ fn points_get_what_a_picture_of_them_would_show() {
         data_window: Window::of_size(edge as u32, edge as u32),
         display_window: Window::of_size(edge as u32, edge as u32),
         world_to_camera: None,
+        world_to_ndc: None,
         position: shown.iter().map(|point| point.position).collect(),
         normal: shown.iter().map(|point| point.normal().to_array()).collect(),
         coverage: vec![1.0; shown.len()],
