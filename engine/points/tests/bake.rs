@@ -118,7 +118,13 @@ fn binary_files_of_both_ends_keep_their_bytes() {
     let folder = tempfile::tempdir().unwrap();
     for (format, big) in [("binary_little_endian", false), ("binary_big_endian", true)] {
         let (input, output) = (folder.path().join("in.ply"), folder.path().join("out.ply"));
-        let float = |value: f32| if big { value.to_be_bytes() } else { value.to_le_bytes() };
+        let float = |value: f32| {
+            let mut bytes = value.to_le_bytes();
+            if big {
+                bytes.reverse();
+            }
+            bytes
+        };
         let mut bytes = format!(
             "ply\nformat {format} 1.0\nelement before 2\nproperty uchar a\nelement vertex {COUNT}\nproperty float x\n\
              property float y\nproperty float z\nproperty uchar class\nelement after 1\nproperty uchar b\nend_header\n"
