@@ -3,7 +3,7 @@
 use indicatif::{ProgressBar, ProgressStyle};
 use pbgi_client::{Job, JobState};
 use std::io::IsTerminal;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 const TICK: Duration = Duration::from_millis(120);
 /// Steps between two plain lines of one stage, in percent.
@@ -13,6 +13,7 @@ const PLAIN_STEP: u64 = 25;
 pub(crate) struct Progress {
     bar: Option<ProgressBar>,
     stage: String,
+    started: Instant,
     step: Option<u64>,
 }
 
@@ -25,6 +26,7 @@ impl Progress {
         Self {
             bar,
             stage: String::new(),
+            started: Instant::now(),
             step: None,
         }
     }
@@ -49,6 +51,7 @@ impl Progress {
         let changed = self.stage != stage;
         if changed {
             self.stage = stage.to_owned();
+            self.started = Instant::now();
             self.step = None;
         }
         match &self.bar {
@@ -80,11 +83,25 @@ impl Progress {
         }
         self.step = step.or(Some(0));
         match step {
-            Some(step) if !first => eprintln!("{}: {} %", self.stage, step * PLAIN_STEP),
+            Some(step) if !first => {
+                let pace = pace(done, total, self.started.elapsed().as_secs_f64());
+                eprintln!("{}: {} %{pace}", self.stage, step * PLAIN_STEP);
+            }
             _ if first => eprintln!("{} ...", self.stage),
             _ => {}
         }
     }
+}
+
+/// How fast a stage goes and how long it will take, once that is worth knowing.
+fn pace(done: u64, total: u64, seconds: f64) -> String {
+    const WORTH_SECS: f64 = 5.0;
+    if seconds < WORTH_SECS || done >= total {
+        return String::new();
+    }
+    let rate = done as f64 / seconds;
+    let left = (total - done) as f64 / rate;
+    format!(", {rate:.0} a second, {left:.0} s left")
 }
 
 impl Drop for Progress {
@@ -111,4 +128,16 @@ fn restyle(bar: &ProgressBar, stage: &str, total: u64) {
         bar.set_style(style);
     }
     bar.set_message(stage.to_owned());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_stage_tells_its_pace() {
+        assert_eq!(pace(50, 200, 10.0), ", 5 a second, 30 s left");
+        assert_eq!(pace(50, 200, 1.0), "");
+        assert_eq!(pace(200, 200, 10.0), "");
+    }
 }

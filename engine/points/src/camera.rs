@@ -63,16 +63,23 @@ impl Camera {
         let from = Vec3::new(0.45, 0.25 + 0.6 * flat, 0.9).normalize();
         let camera = Self::look_at(centre + from, centre, FOV_Y);
         let [right, up, back] = [0, 1, 2].map(|axis| camera.world_from_camera.col(axis).truncate());
-        let tangent = (FOV_Y / 2.0).tan();
-        // As far away as the corner asks that would leave the picture first.
-        let distance = (0..8).map(|corner| {
+        let tangent = (FOV_Y / 2.0).tan() / MARGIN;
+        let corner = |corner: usize| {
             let side = |axis: usize| if corner >> axis & 1 == 1 { high[axis] } else { low[axis] };
-            let corner = Vec3::new(side(0), side(1), side(2)) - centre;
-            let across = (corner.dot(right).abs() / aspect).max(corner.dot(up).abs());
-            corner.dot(back) + across * MARGIN / tangent
-        });
-        let distance = distance.fold(f32::MIN_POSITIVE, f32::max);
-        Self::look_at(centre + from * distance, centre, FOV_Y)
+            Vec3::new(side(0), side(1), side(2)) - centre
+        };
+        // The planes of the pyramid that touch the box on either side meet where the eye is, seen along the other axis.
+        let touching = |across: Vec3, tangent: f32| {
+            let reach = |sign: f32| {
+                let of = |index| sign * corner(index).dot(across) + tangent * corner(index).dot(back);
+                (0..8).map(of).fold(f32::NEG_INFINITY, f32::max)
+            };
+            let (one, other) = (reach(1.0), reach(-1.0));
+            ((one - other) / 2.0, (one + other) / (2.0 * tangent))
+        };
+        let ((x, wide), (y, tall)) = (touching(right, tangent * aspect), touching(up, tangent));
+        let eye = centre + right * x + up * y + back * wide.max(tall).max(f32::MIN_POSITIVE);
+        Self::look_at(eye, eye - back, FOV_Y)
     }
 
     /// World position of the eye.

@@ -16,7 +16,7 @@ const ONE_SURFACE: f32 = 0.01;
 /// An empty pixel among at least this many of its eight neighbours is a gap between points, not the end of a surface.
 const GAP_NEIGHBOURS: usize = 5;
 /// How often gaps are closed from their rims.
-const GAP_ROUNDS: usize = 2;
+const GAP_ROUNDS: usize = 4;
 
 /// What a ray met: position x y z, normal x y z, radiance R G B, coverage.
 pub type RayHit = [f32; 10];

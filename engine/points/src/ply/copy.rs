@@ -143,10 +143,10 @@ fn put_text(line: &mut Vec<u8>, slots: &[Slot], numbers: &[f32]) {
 
 fn put_bytes(vertex: &mut Vec<u8>, slots: &[Slot], numbers: &[f32], encoding: Encoding) {
     for (slot, number) in slots.iter().zip(numbers) {
-        let bytes = match encoding {
-            Encoding::BigEndian => number.to_be_bytes(),
-            Encoding::LittleEndian | Encoding::Ascii => number.to_le_bytes(),
-        };
+        let mut bytes = number.to_le_bytes();
+        if encoding == Encoding::BigEndian {
+            bytes.reverse();
+        }
         match *slot {
             Slot::Behind => vertex.extend(bytes),
             Slot::At { offset, .. } => vertex[offset..offset + bytes.len()].copy_from_slice(&bytes),
