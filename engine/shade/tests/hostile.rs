@@ -103,6 +103,7 @@ fn bomb(info: &mut SceneInfo) -> ArraySource {
         radius_ratio: 0.5,
         spread: 0.0,
         fill: 0.0,
+        variation: 0.0,
         covariance: [0.1, 0.0, 0.1, 0.0, 0.0, 0.0],
         sh: Default::default(),
     };
