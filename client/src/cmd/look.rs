@@ -57,6 +57,15 @@ impl LookArgs {
 }
 
 impl ExposureArgs {
+    /// For pictures of colours that are to stay as they are: radiance 1 is white at 0 stops.
+    pub(crate) fn look_of_colours(&self, png: PathBuf) -> Look {
+        Look {
+            png: Some(png),
+            tone_map: ToneMap::Exposure(self.exposure.unwrap_or(0.0).exp2()),
+            preview: self.preview,
+        }
+    }
+
     pub(crate) fn look(&self, png: Option<PathBuf>) -> Look {
         Look {
             png,

@@ -4,6 +4,7 @@ use super::args::{OutputArgs, QualityArgs, SeenArgs, ServerArgs, Size, StatsArgs
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
+use super::look::ExposureArgs;
 use super::progress::Progress;
 use super::render::{add, temporary_folder};
 use super::session::{self, Work};
@@ -11,7 +12,7 @@ use super::summary;
 use clap::Args;
 use pbgi_client::{Client, LiveJob, ShadeJob};
 use pbgi_core::{Bounds, ShadeSettings, Statistics};
-use pbgi_points::{Camera, GBuffer, GBufferOptions, HitBuffer, LayeredImage, MeshScene, ToneMap, write_png};
+use pbgi_points::{Camera, GBuffer, GBufferOptions, HitBuffer, LayeredImage, MeshScene};
 use std::f32::consts::FRAC_1_PI;
 use std::path::{Path, PathBuf};
 use tokio::sync::mpsc;
@@ -44,9 +45,8 @@ pub(crate) struct ViewArgs {
     output: OutputArgs,
     #[command(flatten)]
     seen: SeenArgs,
-    /// Multiplies the picture's brightness
-    #[arg(long, value_name = "F", default_value_t = 1.0, value_parser = super::args::positive)]
-    exposure: f32,
+    #[command(flatten)]
+    exposure: ExposureArgs,
     #[command(flatten)]
     quality: QualityArgs,
     #[command(flatten)]
@@ -89,10 +89,9 @@ pub(crate) async fn view(args: ViewArgs, interrupt: &Interrupt) -> Result<(), Fa
     };
     let sky = if environment.is_some() { 0.0 } else { 1.0 };
     let pixels = picture(&gbuffer, &LayeredImage::read_exr(&shaded)?, sky)?;
-    let window = gbuffer.data_window;
-    let tone_map = ToneMap::Exposure(args.exposure);
-    write_png(&output, window.width, window.height, &pixels, tone_map)?;
-    eprintln!("wrote {}", args.output.output.display());
+    args.exposure
+        .look_of_colours(output)
+        .show(gbuffer.data_window, &pixels)?;
     summary::report(&statistics, args.stats.stats.as_deref())
 }
 
