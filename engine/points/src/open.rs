@@ -180,7 +180,7 @@ pub fn open_input(paths: &[PathBuf], options: &InputOptions) -> Result<Input, Po
 
 /// Opens one cloud; positions are relative to `origin`.
 pub(crate) fn open_cloud(path: &Path, origin: [f64; 3], options: &CloudOptions) -> Result<Box<dyn Cloud>, PointsError> {
-    Ok(match kind(path)? {
+    Ok(match kind_by_name(path)? {
         Kind::Mesh => return Err(PointsError::unsupported(path, "a mesh as a cloud", "sample it first")),
         Kind::Ply => Box::new(PlyPoints::open(path, origin, options)?),
         Kind::Las => Box::new(LasPoints::open(path, origin, options)?),
@@ -216,10 +216,18 @@ fn of_kind<'a>(kinds: &[(Kind, &'a Path)], wanted: Kind) -> Vec<&'a Path> {
     chosen.map(|(_, path)| *path).collect()
 }
 
-pub(crate) fn kind(path: &Path) -> Result<Kind, PointsError> {
+/// What a build makes of a file: a PLY file with faces is a mesh.
+fn kind(path: &Path) -> Result<Kind, PointsError> {
+    Ok(match kind_by_name(path)? {
+        Kind::Ply if ply::mesh::has_faces(path)? => Kind::Mesh,
+        kind => kind,
+    })
+}
+
+/// What a file is by its name alone, whether it is there or not: the vertices of a PLY file are a cloud.
+pub(crate) fn kind_by_name(path: &Path) -> Result<Kind, PointsError> {
     Ok(match extension(path).as_str() {
         "gltf" | "glb" | "obj" | "toml" => Kind::Mesh,
-        "ply" if ply::mesh::has_faces(path)? => Kind::Mesh,
         "ply" => Kind::Ply,
         "las" | "laz" => Kind::Las,
         "ptc" => Kind::Ptc,

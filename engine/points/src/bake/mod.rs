@@ -14,7 +14,7 @@ pub use values::BakedValues;
 
 use crate::cloud::{CloudOptions, InvalidPoints, place_of};
 use crate::error::PointsError;
-use crate::open::{Kind, kind, open_cloud};
+use crate::open::{Kind, kind_by_name, open_cloud};
 use crate::ply::{PlyForm, PlyPoints, PlyWriter, copy_ply};
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -89,7 +89,7 @@ fn sky_visibility([.., occlusion, x, y, z]: Baked) -> f32 {
 /// # Errors
 /// Kinds of files that do not fit.
 pub fn check_bake(input: &Path, output: &Path) -> Result<(), PointsError> {
-    let (from, to) = (kind(input)?, kind(output).ok());
+    let (from, to) = (kind_by_name(input)?, kind_by_name(output).ok());
     let remedy = match (from, to) {
         (Kind::Mesh, _) => {
             return Err(PointsError::unsupported(
@@ -133,7 +133,7 @@ pub fn write_baked(
         invalid_points: options.invalid_points,
         ..CloudOptions::default()
     };
-    match kind(input)? {
+    match kind_by_name(input)? {
         Kind::Las => las::copy_las(input, output, &mut rows, options)?,
         Kind::Ply if !PlyPoints::open(input, [0.0; 3], &cloud)?.holds_records() => {
             let mut next = |numbers: &mut Vec<f32>| {

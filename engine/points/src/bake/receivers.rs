@@ -3,7 +3,7 @@
 use crate::cloud::{Cloud, CloudOptions, Facing, place_of};
 use crate::error::PointsError;
 use crate::estimate::{Estimated, Means};
-use crate::open::{InputOptions, Kind, kind, open_cloud};
+use crate::open::{InputOptions, Kind, kind_by_name, open_cloud};
 use pbgi_core::{Bounds, PointRecord, PointStream};
 use std::path::Path;
 
@@ -42,7 +42,7 @@ impl Receivers {
         let missing = cloud.missing();
         let count = cloud.len_hint().unwrap_or(0);
         cloud.number();
-        let source = if kind(path)? == Kind::Scene {
+        let source = if kind_by_name(path)? == Kind::Scene {
             Source::InOrder(cloud)
         } else {
             let wanted = CloudOptions {
