@@ -249,7 +249,7 @@ mod tests {
         };
         let text = describe(&info);
         assert!(
-            text.contains("the scene is empty") && text.contains("0 of 28.0 KiB"),
+            text.contains("the scene is empty") && text.contains("0 of 29.0 KiB"),
             "{text}"
         );
     }

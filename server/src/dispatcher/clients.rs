@@ -536,7 +536,7 @@ fn with_reason(what: &str, reason: &str) -> String {
     }
 }
 
-fn waiting(options: &JobOptions) -> &'static str {
+pub(super) fn waiting(options: &JobOptions) -> &'static str {
     match options.paused {
         true => "paused",
         false => "waiting",

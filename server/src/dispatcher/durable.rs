@@ -151,7 +151,7 @@ impl Dispatcher {
             status.note("the daemon died");
         }
         if goes_on {
-            (status.state, status.stage) = (JobState::Queued, "waiting".into());
+            (status.state, status.stage) = (JobState::Queued, super::clients::waiting(&status.options).into());
         }
         let (kind, options) = (request.kind(), status.options.clone());
         state.names.insert(status.id.clone(), job);
