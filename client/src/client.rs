@@ -318,7 +318,7 @@ impl Client {
             message,
         })?;
         let answer = SceneServiceClient::new(self.channel.clone())
-            .get_scene_shape(wish.request(v1::GetSceneRequest { scene }))
+            .get_scene_shape(self.request(&wish, v1::GetSceneRequest { scene }))
             .await;
         Ok(answer.map_err(|status| wish.failed(&status))?.into_inner().into())
     }
@@ -329,7 +329,10 @@ impl Client {
     /// A lost connection.
     pub async fn cache(&self) -> Result<CacheStatus, ClientError> {
         let wish = Wish::new("ask for the state of the page cache", REQUEST_SECS);
-        let answer = self.daemon().get_cache(wish.request(v1::GetCacheRequest {})).await;
+        let answer = self
+            .daemon()
+            .get_cache(self.request(&wish, v1::GetCacheRequest {}))
+            .await;
         Ok(answer.map_err(|status| wish.failed(&status))?.into_inner().into())
     }
 

@@ -18,7 +18,7 @@ mod scene;
 pub use disk::forget;
 pub use house::{DAEMON, House, Job, PATIENCE, Run, program, signal, wait_for, workspace_root};
 pub use nix::sys::signal::Signal;
-pub use picture::{Picture, assert_same, assert_same_values, relative_rms, rms};
+pub use picture::{Picture, SHADED, assert_same, assert_same_values, relative_rms, rms};
 pub use scene::{flip_bit, page_count};
 
 use std::path::PathBuf;

@@ -4,6 +4,17 @@ use exr::prelude::{ReadChannels, ReadLayers, read};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+/// Channels that every shaded picture has, besides coverage.
+pub const SHADED: [&str; 7] = [
+    "indirect.R",
+    "indirect.G",
+    "indirect.B",
+    "occlusion.Z",
+    "bentnormal.X",
+    "bentnormal.Y",
+    "bentnormal.Z",
+];
+
 /// Channels of a single-part EXR file, row-major over its data window.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {

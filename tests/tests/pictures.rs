@@ -4,18 +4,8 @@
 
 use glam::Vec3;
 use pbgi_points::{GBuffer, LayeredImage};
-use pbgi_tests::{DAEMON, House, workspace_root};
+use pbgi_tests::{DAEMON, House, SHADED, workspace_root};
 use std::collections::BTreeSet;
-
-const CHANNELS: [&str; 7] = [
-    "indirect.R",
-    "indirect.G",
-    "indirect.B",
-    "occlusion.Z",
-    "bentnormal.X",
-    "bentnormal.Y",
-    "bentnormal.Z",
-];
 
 /// D14: a pixel with a broken number is black and counted, and spoils no other.
 #[test]
@@ -47,7 +37,7 @@ fn holes_of_a_gbuffer_stay_black_and_do_not_spread() {
     // Receivers are shaded in groups of 8 by 8, which share what is far away.
     let group = |pixel: usize| (pixel % 64 / 8, pixel / 64 / 8);
     let touched: BTreeSet<_> = holes.iter().map(|&hole| group(hole)).collect();
-    for name in CHANNELS {
+    for name in SHADED {
         let (whole, torn) = (whole.channel(name).unwrap(), torn.channel(name).unwrap());
         for pixel in 0..64 * 48 {
             if holes.contains(&pixel) {

@@ -25,10 +25,19 @@ pub struct ClusterAccumulator {
     normal: DVec3,
     /// Sum of area times normal outer normal: xx, yy, zz, xy, xz, yz.
     normal_moment: [f64; 6],
-    /// Sums of area times radiance (mean of the channels), and times its square: front, back.
-    light: [[f64; 2]; 2],
+    /// Light of the front and of the back.
+    light: [LightSums; 2],
     radius_max: f32,
     point_count: u64,
+}
+
+/// Sums over the radiance of one side.
+#[derive(Clone, Copy, Debug, Default)]
+struct LightSums {
+    /// Area times radiance.
+    first: DVec3,
+    /// Area times the sum of the squares of the channels.
+    second: f64,
 }
 
 /// A node's attributes, ready to be packed, and what packing lost.
@@ -49,7 +58,7 @@ impl Default for ClusterAccumulator {
             second_moment: [0.0; 6],
             normal: DVec3::ZERO,
             normal_moment: [0.0; 6],
-            light: [[0.0; 2]; 2],
+            light: [LightSums::default(); 2],
             radius_max: 0.0,
             point_count: 0,
         }
@@ -92,9 +101,9 @@ impl ClusterAccumulator {
             self.normal_moment[i] += area * outer_normal[i];
         }
         for (sums, side) in self.light.iter_mut().zip([sides.front, sides.back]) {
-            let radiance = f64::from(side[0] + side[1] + side[2]) / 3.0;
-            sums[0] += area * radiance;
-            sums[1] += area * radiance * radiance;
+            let radiance = DVec3::from_array(side.map(f64::from));
+            sums.first += radiance * area;
+            sums.second += area * radiance.length_squared();
         }
         self.radius_max = self.radius_max.max(point.radius);
         self.point_count += 1;
@@ -114,8 +123,9 @@ impl ClusterAccumulator {
             self.second_moment[i] += child.second_moment[i];
             self.normal_moment[i] += child.normal_moment[i];
         }
-        for (sums, other) in self.light.iter_mut().flatten().zip(child.light.iter().flatten()) {
-            *sums += other;
+        for (sums, other) in self.light.iter_mut().zip(&child.light) {
+            sums.first += other.first;
+            sums.second += other.second;
         }
         self.radius_max = self.radius_max.max(child.radius_max);
         self.point_count += child.point_count;
@@ -164,8 +174,9 @@ impl ClusterAccumulator {
     /// See [`NodeAttributes::variation`].
     fn variation(&self) -> f32 {
         let [front, back] = self.light.map(|sums| {
-            let mean = sums[0] / self.area;
-            (mean, (sums[1] / self.area - mean * mean).max(0.0).sqrt())
+            let mean = sums.first / self.area;
+            let variance = sums.second / self.area - mean.length_squared();
+            (mean.length(), variance.max(0.0).sqrt())
         });
         let (brightest, deviation) = (front.0.max(back.0), front.1.max(back.1));
         if deviation > 0.0 {
@@ -311,6 +322,10 @@ mod tests {
         });
         assert!((variation(&points) - 0.5).abs() < 1e-3, "{}", variation(&points));
         assert_eq!(variation(&wall([0.0; 3], [0.0; 3])), 0.0);
+        // Colours of one brightness are not even.
+        let mut points = wall([1.0, 0.0, 0.0], [0.0; 3]);
+        points.extend(wall([0.0, 1.0, 0.0], [0.0; 3]));
+        assert!((variation(&points) - 1.0).abs() < 1e-3, "{}", variation(&points));
     }
 
     #[test]

@@ -191,7 +191,8 @@ impl NodeRecord {
         f32::from(self.fill_code) / FILL_STEPS
     }
 
-    /// Standard deviation of the radiance of a side over the mean of the brighter one, rounded up; 1 and more are 1.
+    /// Standard deviation of the radiance of a side, over all channels, over the mean of the brighter one, rounded up; 1 and
+    /// more are 1.
     #[inline]
     pub fn variation(&self) -> f32 {
         f32::from(self.variation_code) / SHARE_STEPS

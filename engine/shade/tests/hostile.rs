@@ -22,6 +22,21 @@ fn random(state: &mut u64) -> u64 {
     z ^ (z >> 31)
 }
 
+/// A floor and a ball over it.
+fn floor_and_ball() -> Vec<PointRecord> {
+    let mut points = vec![];
+    support::quad(
+        Vec3::new(-1.0, 0.0, -1.0),
+        Vec3::Z * 2.0,
+        Vec3::X * 2.0,
+        24,
+        1.0,
+        &mut points,
+    );
+    support::sphere(Vec3::new(0.0, 0.8, 0.0), 0.4, 600, 2.0, &mut points);
+    points
+}
+
 /// Eight receivers over a floor, so that all lanes are at work.
 fn receivers() -> Vec<Receiver> {
     let receiver = |lane: u8| Receiver {
@@ -134,17 +149,7 @@ fn forged_scenes_end_within_the_budget_of_a_cut_and_never_panic() {
     let mutants: u64 = std::env::var("PBGI_MUTANTS").map_or(4_000, |text| text.parse().unwrap());
     let mut seed: u64 = std::env::var("PBGI_SEED").map_or(1, |text| text.parse().unwrap());
     println!("PBGI_SEED={seed}");
-    let mut points = vec![];
-    support::quad(
-        Vec3::new(-1.0, 0.0, -1.0),
-        Vec3::Z * 2.0,
-        Vec3::X * 2.0,
-        24,
-        1.0,
-        &mut points,
-    );
-    support::sphere(Vec3::new(0.0, 0.8, 0.0), 0.4, 600, 2.0, &mut points);
-    let (info, good) = support::build(&points);
+    let (info, good) = support::build(&floor_and_ball());
     let (mut refused, mut slowest) = (0, Duration::ZERO);
     for _ in 0..mutants {
         let mut source = Counting {
@@ -224,16 +229,7 @@ fn millions_of_points_at_one_place_are_one_cluster_to_a_shading_call() {
 
 #[test]
 fn receivers_on_points_and_inside_of_clusters_get_finite_light() {
-    let mut points = vec![];
-    support::quad(
-        Vec3::new(-1.0, 0.0, -1.0),
-        Vec3::Z * 2.0,
-        Vec3::X * 2.0,
-        24,
-        1.0,
-        &mut points,
-    );
-    support::sphere(Vec3::new(0.0, 0.8, 0.0), 0.4, 600, 2.0, &mut points);
+    let points = floor_and_ball();
     let (info, mut source) = support::build(&points);
     let mut shader = Shader::new(&info, settings(0.05), None).unwrap();
     let (mut seed, mut shaded) = (1, 0);
