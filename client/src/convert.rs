@@ -99,6 +99,7 @@ fn wire_cloud(cloud: &CloudOptions) -> v1::CloudSettings {
             Radius::Estimate => v1::cloud_settings::Radius::EstimateRadius(true),
             Radius::Fixed(radius) => v1::cloud_settings::Radius::FixedRadius(radius),
         }),
+        albedo: cloud.albedo,
     }
 }
 
@@ -118,6 +119,7 @@ fn wire_shade_settings(settings: &ShadeSettings) -> v1::ShadeSettings {
         max_dist: Some(settings.max_dist),
         falloff: Some(settings.falloff),
         bias: Some(settings.bias),
+        bounces: Some(settings.bounces),
     }
 }
 

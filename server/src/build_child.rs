@@ -7,8 +7,8 @@ use nix::sys::resource::{Resource, setrlimit};
 use nix::sys::signal::{SigSet, Signal};
 use pbgi_build::limits::MEMORY_MIN_BYTES;
 use pbgi_build::{BuildProgress, BuildReport, BuildRequest, build};
-use pbgi_core::{BuildSettings, Statistics};
-use pbgi_points::{CloudOptions, Density, InputOptions};
+use pbgi_core::{BuildSettings, PointStream, Statistics};
+use pbgi_points::{BouncedPoints, CloudOptions, Density, InputOptions, PointsError};
 use pbgi_store::Overwrite;
 use serde::{Deserialize, Serialize};
 use std::fs;
@@ -27,6 +27,8 @@ use std::time::{Duration, Instant};
 pub struct Spec {
     /// Points or meshes.
     pub inputs: Vec<PathBuf>,
+    /// Light that the points of the one input, a scene, received and reflect too; `None` for inputs as they are.
+    pub received: Option<PathBuf>,
     /// The scene directory.
     pub output: PathBuf,
     /// Whether one that is there is replaced.
@@ -135,7 +137,17 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
         scratch_dir: spec.scratch_dir.clone(),
         ..default
     };
-    let mut points = pbgi_points::open_input(&spec.inputs, &options).map_err(|error| error.to_string())?;
+    let text = |error: PointsError| error.to_string();
+    let (mut input, mut bounced) = (None, None);
+    let (points, input_bytes): (&mut dyn PointStream<Error = PointsError>, u64) =
+        match (&spec.received, &spec.inputs[..]) {
+            (Some(received), [scene]) => (bounced.insert(BouncedPoints::open(scene, received).map_err(text)?), 0),
+            _ => {
+                let points = input.insert(pbgi_points::open_input(&spec.inputs, &options).map_err(text)?);
+                let bytes = points.memory_bytes();
+                (points, bytes)
+            }
+        };
     let request = BuildRequest {
         output: spec.output.clone(),
         overwrite: if spec.overwrite {
@@ -144,7 +156,7 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
             Overwrite::Refuse
         },
         scratch_dir: spec.scratch_dir.clone(),
-        memory_bytes: spec.memory_bytes.saturating_sub(points.memory_bytes()),
+        memory_bytes: spec.memory_bytes.saturating_sub(input_bytes),
         settings: spec.settings,
         input_key: input_key(spec),
     };
@@ -167,10 +179,10 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
             ControlFlow::Continue(())
         }
     };
-    let report = build(&mut points, &request, &mut observer).map_err(|error| error.to_string())?;
+    let report = build(points, &request, &mut observer).map_err(|error| error.to_string())?;
     let (bytes_read, bytes_written) = traffic.map(transferred).unwrap_or_default();
     Ok(Statistics {
-        points_skipped: Some(points.skipped() as f64),
+        points_skipped: Some(input.map_or(0, |input| input.skipped()) as f64),
         bytes_read,
         bytes_written,
         ..statistics(&report)

@@ -26,6 +26,23 @@ pub async fn run(
     dispatcher: &Arc<Dispatcher>,
     job: JobNo,
     task: &BuildTask,
+    abort: watch::Receiver<bool>,
+) -> Result<Statistics, String> {
+    let spec = spec(dispatcher, task).map_err(|error| error.text)?;
+    let built = run_child(dispatcher, job, &spec, abort).await;
+    let mut statistics = built.map_err(|error| hide(dispatcher, task, error))?;
+    statistics.peak_memory_bytes = Some(dispatcher.peaks(job).0 as f64);
+    Ok(statistics)
+}
+
+/// Runs a build child to its end.
+///
+/// # Errors
+/// A text for people, with real paths.
+pub(crate) async fn run_child(
+    dispatcher: &Arc<Dispatcher>,
+    job: JobNo,
+    spec: &Spec,
     mut abort: watch::Receiver<bool>,
 ) -> Result<Statistics, String> {
     let memory = &dispatcher.config.memory;
@@ -34,7 +51,6 @@ pub async fn run(
         permit = dispatcher.work_memory.acquire_many(megabytes) => permit.map_err(|error| error.to_string())?,
         _ = abort.wait_for(|stop| *stop) => return Err("stopped".into()),
     };
-    let spec = spec(dispatcher, task).map_err(|error| error.text)?;
     let started = dispatcher.supervisor.build(job.0).await;
     let child = started.map_err(|error| format!("cannot start a build process: {error}"))?;
     dispatcher.build_started(job, child.pid);
@@ -45,22 +61,18 @@ pub async fn run(
             supervisor.stop_build(job.0);
         }
     });
-    let outcome = follow(dispatcher, job, &spec, child).await;
+    let outcome = follow(dispatcher, job, spec, child).await;
     stopper.abort();
-    let mut statistics = match outcome {
-        Ok(statistics) => statistics,
-        Err(error) => {
-            let (output, scratch) = (spec.output, spec.scratch_dir);
-            // What a killed child could not remove is not locked any more.
-            let swept = tokio::task::spawn_blocking(move || sweep(&output, &scratch));
-            if let Err(error) = swept.await {
-                tracing::error!(%error, "sweep after a failed build panicked");
-            }
-            return Err(hide(dispatcher, task, error));
+    dispatcher.build_ended(job);
+    if outcome.is_err() {
+        let (output, scratch) = (spec.output.clone(), spec.scratch_dir.clone());
+        // What a killed child could not remove is not locked any more.
+        let swept = tokio::task::spawn_blocking(move || sweep(&output, &scratch));
+        if let Err(error) = swept.await {
+            tracing::error!(%error, "sweep after a failed build panicked");
         }
-    };
-    statistics.peak_memory_bytes = Some(dispatcher.peaks(job).0 as f64);
-    Ok(statistics)
+    }
+    outcome
 }
 
 /// What the child must know; its paths are real ones, and it is kept to their roots.
@@ -81,6 +93,7 @@ fn spec(dispatcher: &Dispatcher, task: &BuildTask) -> Result<Spec, JobError> {
     });
     Ok(Spec {
         inputs: task.inputs.iter().map(real).collect::<Result<_, _>>()?,
+        received: None,
         output,
         overwrite: task.overwrite,
         settings: task.settings,

@@ -288,6 +288,7 @@ fn sweep(config: &Config, state: &StateDir) -> Result<(), ServerError> {
         Ok(_) => {}
         Err(error) => tracing::warn!(%error, "cannot sweep scratch"),
     }
+    crate::bounce::sweep(scratch);
     if let Err(error) = crate::output::sweep(scratch) {
         tracing::warn!(%error, "cannot sweep scratch");
     }

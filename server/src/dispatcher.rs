@@ -12,6 +12,7 @@ mod upkeep;
 pub use clients::{CacheReport, DaemonStatus, Submission};
 pub use figures::{JobFigures, SceneFigures, Totals};
 
+use crate::bounce::Makers;
 use crate::config::Config;
 use crate::error::{JobError, JobErrorKind};
 use crate::framebuffer::{Preview, TileReceivers};
@@ -45,6 +46,8 @@ pub struct Dispatcher {
     pub(crate) work_memory: Arc<Semaphore>,
     /// One picture is read at a time: how large it is shows only then.
     pub(crate) picture_gate: tokio::sync::Mutex<()>,
+    /// Who makes which scene of further bounces.
+    pub(crate) makers: Makers,
     runtime: tokio::runtime::Handle,
     /// Rung when a worker that found no tile may ask again.
     wake: Notify,
@@ -177,6 +180,7 @@ impl Dispatcher {
         Self {
             work_memory: Arc::new(Semaphore::new((config.memory.work_bytes >> 20) as usize)),
             picture_gate: tokio::sync::Mutex::new(()),
+            makers: Makers::default(),
             config,
             cache,
             mounts,
@@ -305,7 +309,6 @@ impl Dispatcher {
 
     fn finished(self: &Arc<Self>, job: JobNo, outcome: Result<pbgi_core::Statistics, String>) {
         let mut state = self.lock();
-        state.build_pids.remove(&job);
         if let (Some(record), Ok(statistics)) = (state.jobs.get(&job), &outcome) {
             record.status.send_modify(|status| {
                 status.statistics.update(statistics);

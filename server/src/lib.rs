@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub mod access;
+mod bounce;
 pub mod budget;
 pub mod build_child;
 pub mod builder;

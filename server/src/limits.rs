@@ -79,6 +79,11 @@ pub const LIVE_TILES_MAX: usize = 64;
 /// Bytes of a message of a stream: 170 tiles.
 pub const LIVE_MESSAGE_BYTES_MAX: usize = 4 << 20;
 
+/// Scenes of further bounces that are kept, and for how long after their last use.
+pub const BOUNCED_SCENES_MAX: usize = 16;
+/// See [`BOUNCED_SCENES_MAX`].
+pub const BOUNCED_SCENES_KEPT: Duration = Duration::from_secs(24 * 3600);
+
 /// Time between two looks at leases, idle time and memory.
 pub const TICK: Duration = Duration::from_millis(200);
 /// How long leased tiles may take when the daemon stops.

@@ -40,6 +40,24 @@ pub struct LiveTask {
     pub priority: i32,
     /// Angle between neighbouring rays, radians, where rays are traced instead.
     pub pixel_angle: Option<f32>,
+    /// Most workers at once; `None` for all.
+    pub workers: Option<usize>,
+}
+
+/// What a session shades with.
+pub(crate) struct Session {
+    /// The scene.
+    pub(crate) mounted: Mounted,
+    /// How to shade.
+    pub(crate) settings: ShadeSettings,
+    /// Light from far away.
+    pub(crate) environment: Option<Arc<Environment>>,
+    /// For whom.
+    pub(crate) user: String,
+    /// Higher ones go first.
+    pub(crate) priority: i32,
+    /// See [`LiveTask::pixel_angle`].
+    pub(crate) pixel_angle: Option<f32>,
 }
 
 /// A tile's values, or why there will be no more.

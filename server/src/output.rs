@@ -82,7 +82,8 @@ pub fn sweep(scratch: &Path) -> io::Result<usize> {
     Ok(count)
 }
 
-fn unique() -> String {
+/// A part of a name that nobody else uses.
+pub(crate) fn unique() -> String {
     use std::sync::atomic::{AtomicU64, Ordering};
     static NEXT: AtomicU64 = AtomicU64::new(0);
     format!("{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
@@ -117,6 +118,7 @@ fn layered(picture: &Picture, planes: Planes) -> Result<LayeredImage, String> {
     set("max_dist", settings.max_dist.to_string());
     set("falloff", settings.falloff.to_string());
     set("bias", settings.bias.to_string());
+    set("bounces", settings.bounces.to_string());
     if let Some(environment) = &task.environment {
         set("environment", name(environment));
     }

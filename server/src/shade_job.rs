@@ -1,5 +1,6 @@
 //! A picture's life around its tiles: open the scene, read the G-buffer, wait for memory; afterwards add up and write.
 
+use crate::bounce::{self, Wanted};
 use crate::dispatcher::Dispatcher;
 use crate::error::JobError;
 use crate::framebuffer::Framebuffer;
@@ -132,12 +133,26 @@ pub async fn prepare(
     stored: Option<String>,
     mut abort: watch::Receiver<bool>,
 ) -> Result<Shading, String> {
+    let (this, checked) = (dispatcher.clone(), task.clone());
+    let checked = tokio::task::spawn_blocking(move || check(&this, &checked)).await;
+    let environment = checked.map_err(|error| error.to_string())??;
+    let options = dispatcher.options_of(job);
+    let wanted = Wanted {
+        scene: task.scene.clone(),
+        settings: task.settings,
+        environment,
+        user: options.user,
+        priority: options.priority,
+        workers: task.workers,
+    };
+    let mounted = bounce::lit_scene(dispatcher, job, &wanted, &abort).await;
+    let (mounted, environment) = (mounted.map_err(|error| error.text)?, wanted.environment);
     let gate = tokio::select! {
         gate = dispatcher.picture_gate.lock() => gate,
         _ = abort.wait_for(|stop| *stop) => return Err(STOPPED.into()),
     };
     let (this, task) = (dispatcher.clone(), task.clone());
-    let read = tokio::task::spawn_blocking(move || read(&this, job, &task, stored)).await;
+    let read = tokio::task::spawn_blocking(move || read(&this, job, &task, (mounted, environment), stored)).await;
     let (mut shading, pixels) = read.map_err(|error| error.to_string())??;
     let passed = shading.passed.channel_count() as u64 * limits::PASSED_BYTES_PER_PIXEL;
     let megabytes = (pixels * (limits::PICTURE_BYTES_PER_PIXEL + passed))
@@ -165,29 +180,35 @@ pub async fn prepare(
 /// Why a stopped job's task ended; the scheduler knows the real reason.
 const STOPPED: &str = "stopped";
 
-/// Reads everything; also returns the pixels of the picture.
-fn read(
-    dispatcher: &Dispatcher,
-    job: JobNo,
-    task: &ShadeTask,
-    stored: Option<String>,
-) -> Result<(Shading, u64), String> {
-    // Said now, not after the work is done.
+/// What can be said before any work is done: whether the output may be written, and whether what is read can be opened.
+/// Returns the environment.
+fn check(dispatcher: &Dispatcher, task: &ShadeTask) -> Result<Option<Arc<Environment>>, String> {
     let text = |error: JobError| error.text;
     let output = dispatcher.roots().write(&task.output, task.overwrite).map_err(text)?;
     if !task.overwrite && std::fs::symlink_metadata(&output.path).is_ok() {
         let path = task.output.clone();
         return Err(StoreError::Exists { path }.to_string());
     }
-    let mounted = dispatcher.open_scene(&task.scene).map_err(text)?;
-    let places = |path: &PathBuf| dispatcher.roots().read(path).map_err(text);
-    let gbuffer_place = places(&task.gbuffer)?;
-    let environment_place = task.environment.as_ref().map(places).transpose()?;
+    dispatcher.open_scene(&task.scene).map_err(text)?;
+    dispatcher.roots().read(&task.gbuffer).map_err(text)?;
     let environment = task
         .environment
         .as_deref()
         .map(|path| dispatcher.read_environment(path).map_err(text));
-    let environment = environment.transpose()?;
+    environment.transpose()
+}
+
+/// Reads everything; also returns the pixels of the picture.
+fn read(
+    dispatcher: &Dispatcher,
+    job: JobNo,
+    task: &ShadeTask,
+    (mounted, environment): (Mounted, Option<Arc<Environment>>),
+    stored: Option<String>,
+) -> Result<(Shading, u64), String> {
+    let places = |path: &PathBuf| dispatcher.roots().read(path).map_err(|error| error.text);
+    let gbuffer_place = places(&task.gbuffer)?;
+    let environment_place = task.environment.as_ref().map(places).transpose()?;
     let environment_path = environment_place.as_ref().map(|place| place.path.as_path());
     let fingerprint = fingerprint(&mounted, &gbuffer_place.path, environment_path);
     let hide = |error: PointsError| gbuffer_place.hide(&error.to_string());

@@ -58,7 +58,13 @@ impl Truth {
     fn new(mesh: &MeshScene, receivers: &[Receiver]) -> Self {
         let cast = |salt: u64| -> Vec<[f32; 2]> {
             let at = |(receiver, index): (&Receiver, u64)| {
-                let found = mesh.raycast(receiver.position, receiver.normal, REFERENCE_SIDE, salt << 40 | index);
+                let found = mesh.raycast(
+                    receiver.position,
+                    receiver.normal,
+                    REFERENCE_SIDE,
+                    salt << 40 | index,
+                    1,
+                );
                 [found.occlusion, mean(found.irradiance)]
             };
             receivers.iter().zip(0..).map(at).collect()
@@ -197,7 +203,7 @@ fn ray_rows(mesh: &MeshScene, receivers: &[Receiver], truth: &Truth, side: u32) 
     let occlusion_micros = start.elapsed().as_secs_f64() * 1e6 / receivers.len() as f64;
     let start = Instant::now();
     let bounce = receivers.iter().enumerate().map(|(index, receiver)| {
-        let found = mesh.raycast(receiver.position, receiver.normal, side, seed(index));
+        let found = mesh.raycast(receiver.position, receiver.normal, side, seed(index), 1);
         [found.occlusion, mean(found.irradiance)]
     });
     let bounce: Vec<[f32; 2]> = bounce.collect();

@@ -155,7 +155,7 @@ impl ReadingArgs {
             invalid_points: self.invalid_points.unwrap_or_default(),
             recompute_bounds: self.recompute_bounds,
             estimate_normals: self.estimate_normals,
-            radius: None,
+            ..CloudOptions::default()
         }
     }
 }
@@ -168,12 +168,16 @@ pub(crate) struct CloudArgs {
     /// Radius of points whose file has none: auto, from their distances, or a length
     #[arg(long, allow_negative_numbers = true, value_name = "R", value_parser = radius, help_heading = "Point clouds")]
     radius: Option<Radius>,
+    /// Albedo of points whose file has none, 0 to 1: what --bounces needs to know of scans
+    #[arg(long, allow_negative_numbers = true, value_name = "A", value_parser = albedo, help_heading = "Point clouds")]
+    albedo: Option<f32>,
 }
 
 impl CloudArgs {
     pub(crate) fn options(&self) -> CloudOptions {
         CloudOptions {
             radius: self.radius,
+            albedo: self.albedo,
             ..self.reading.options()
         }
     }
@@ -212,6 +216,13 @@ fn radius(text: &str) -> Result<Radius, String> {
     }
 }
 
+fn albedo(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(value) if (0.0..=1.0).contains(&value) => Ok(value),
+        _ => Err("it must be from 0 to 1".to_owned()),
+    }
+}
+
 fn invalid_points(text: &str) -> Result<InvalidPoints, String> {
     match text {
         "refuse" => Ok(InvalidPoints::Refuse),
@@ -247,6 +258,9 @@ pub(crate) struct QualityArgs {
     /// Surfaces within this fraction of a point's radius are the receiver's own [default: 0.1]
     #[arg(long, allow_negative_numbers = true, value_name = "B")]
     pub(crate) bias: Option<f32>,
+    /// How often light is reflected on its way, 1 to 16: each beyond the first shades the scene's points [default: 1]
+    #[arg(long, allow_negative_numbers = true, value_name = "N")]
+    pub(crate) bounces: Option<u32>,
     /// Light probe around the scene: a latitude-longitude .hdr or .exr, y up [default: black]
     #[arg(long, value_name = "FILE")]
     pub(crate) environment: Option<PathBuf>,
@@ -261,6 +275,7 @@ impl QualityArgs {
             max_dist: self.max_dist.unwrap_or(default.max_dist),
             falloff: self.falloff.unwrap_or(default.falloff),
             bias: self.bias.unwrap_or(default.bias),
+            bounces: self.bounces.unwrap_or(default.bounces),
         };
         settings.validate()?;
         Ok(settings)

@@ -4,7 +4,6 @@
 use crate::error::BuildError;
 use crate::report::{BuildProgress, Stage, StageSeconds};
 use crate::sort::sorter::Sorter;
-use pbgi_core::limits::HALF_MAX;
 use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream, Quantizer};
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
@@ -97,8 +96,7 @@ impl Tally {
         }
         self.bounds.include(point.position);
         self.radius_max = self.radius_max.max(point.radius);
-        let mut radiance = point.front_radiance.iter().chain(&point.back_radiance);
-        self.radiance_clamped += u64::from(radiance.any(|value| value.to_f32() >= HALF_MAX));
+        self.radiance_clamped += u64::from(point.is_clamped());
         true
     }
 

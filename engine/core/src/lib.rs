@@ -14,6 +14,7 @@ pub mod node;
 pub mod octahedral;
 pub mod pack;
 pub mod point;
+pub mod rgb9e5;
 pub mod scene;
 pub mod section;
 pub mod settings;

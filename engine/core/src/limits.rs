@@ -55,7 +55,10 @@ pub const MAX_SOLID_ANGLE_DEFAULT: f32 = 0.05;
 /// Default rows and columns of the raster.
 pub const RASTER_RESOLUTION_DEFAULT: u32 = 64;
 
-/// Largest finite value of a half-precision float; radiance is clamped here when records are packed.
+/// Most bounces of light: at an albedo of 0.8 the sixteenth adds less than three hundredths.
+pub const BOUNCES_MAX: u32 = 16;
+
+/// Largest finite value of a half-precision float; harmonics are clamped here when records are packed.
 pub const HALF_MAX: f32 = 65_504.0;
 
 /// Memory cap where none is given, unless the machine has less to offer.

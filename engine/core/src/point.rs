@@ -1,21 +1,21 @@
 //! The point: one disc of surface with the light that leaves it, 32 bytes.
 
-use crate::limits::HALF_MAX;
 use crate::octahedral;
+use crate::rgb9e5::{self, RGB9E5_MAX};
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
-use half::f16;
 
 /// One oriented disc (surfel), as it lies in files, pages and sort runs.
 ///
 /// ```text
-/// byte 0          12       16       20           26          32
-///      | position  | radius | normal | front      | back      |
-///      | 3 x f32   | f32    | 2 x i16| 3 x f16    | 3 x f16   |
+/// byte 0          12       16       20       24       28           32
+///      | position  | radius | normal | front  | back   | albedo     |
+///      | 3 x f32   | f32    | 2 x i16| rgb9e5 | rgb9e5 | 3 x 10 bits|
 /// ```
 ///
 /// The paper keeps one colour; a thin surface that is lit from both sides needs two, so each side carries the radiance that
-/// leaves it. The normal is octahedral to make room.
+/// leaves it, and light that comes back from other surfaces needs to know how much of it is reflected. Shared exponents and an
+/// octahedral normal make room.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct PointRecord {
@@ -25,10 +25,13 @@ pub struct PointRecord {
     pub radius: f32,
     /// Unit normal, octahedral ([`crate::octahedral`]); it points to the front side.
     pub normal_code: [i16; 2],
-    /// Outgoing radiance of the front side, W/(m2 sr), diffuse: equal in all directions.
-    pub front_radiance: [f16; 3],
+    /// Outgoing radiance of the front side, W/(m2 sr), diffuse: equal in all directions ([`crate::rgb9e5`]).
+    pub front_code: u32,
     /// Outgoing radiance of the back side.
-    pub back_radiance: [f16; 3],
+    pub back_code: u32,
+    /// What is reflected of light that arrives: red, green and blue in ten bits each, from the lowest, then one bit that is set
+    /// where the back reflects too. See [`Reflectance`].
+    pub albedo_code: u32,
 }
 
 const _: () = assert!(size_of::<PointRecord>() == 32);
@@ -60,8 +63,23 @@ pub struct Sides {
     pub back: [f32; 3],
 }
 
+/// How a disc reflects light that arrives from other surfaces: diffusely.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Reflectance {
+    /// Share of each channel, 0 to 1.
+    pub albedo: [f32; 3],
+    /// Whether the back does as well as the front.
+    pub both_sides: bool,
+}
+
+/// Bits of a channel of the albedo.
+const ALBEDO_BITS: u32 = 10;
+const ALBEDO_MAX: u32 = (1 << ALBEDO_BITS) - 1;
+const BOTH_SIDES_BIT: u32 = 1 << (3 * ALBEDO_BITS);
+
 impl PointRecord {
-    /// Checks and packs one point. Radiance above [`HALF_MAX`] is clamped to it (see [`Self::clamps`]).
+    /// Checks and packs one point that reflects nothing. Radiance above [`RGB9E5_MAX`] is clamped to it (see
+    /// [`Self::is_clamped`]).
     ///
     /// # Errors
     /// The first field that cannot be used.
@@ -82,19 +100,44 @@ impl PointRecord {
         if sides.front.iter().chain(&sides.back).any(|&value| value < 0.0) {
             return Err(InvalidPoint::NegativeRadiance);
         }
-        let pack = |rgb: [f32; 3]| rgb.map(|value| f16::from_f32(value.min(HALF_MAX)));
         Ok(Self {
             position,
             radius,
             normal_code: octahedral::encode(normal),
-            front_radiance: pack(sides.front),
-            back_radiance: pack(sides.back),
+            front_code: rgb9e5::encode(sides.front),
+            back_code: rgb9e5::encode(sides.back),
+            albedo_code: 0,
         })
     }
 
-    /// Whether packing these radiances would clamp any of them.
-    pub fn clamps(sides: &Sides) -> bool {
-        sides.front.iter().chain(&sides.back).any(|&value| value > HALF_MAX)
+    /// The same point with this reflectance; an albedo outside of 0 to 1 is clamped.
+    #[must_use]
+    pub fn with_reflectance(self, reflectance: Reflectance) -> Self {
+        let [r, g, b] = reflectance
+            .albedo
+            .map(|share| (share.clamp(0.0, 1.0) * ALBEDO_MAX as f32).round() as u32);
+        let albedo_code = match r | g << ALBEDO_BITS | b << (2 * ALBEDO_BITS) {
+            0 => 0,
+            code if reflectance.both_sides => code | BOTH_SIDES_BIT,
+            code => code,
+        };
+        Self { albedo_code, ..self }
+    }
+
+    /// The same point with this radiance, from zero up; above [`RGB9E5_MAX`] it is clamped.
+    #[must_use]
+    pub fn with_sides(self, sides: Sides) -> Self {
+        Self {
+            front_code: rgb9e5::encode(sides.front),
+            back_code: rgb9e5::encode(sides.back),
+            ..self
+        }
+    }
+
+    /// Whether a radiance is the largest there is: most likely it was larger.
+    pub fn is_clamped(&self) -> bool {
+        let sides = self.sides();
+        sides.front.iter().chain(&sides.back).any(|&value| value >= RGB9E5_MAX)
     }
 
     /// Checks a record that came from a file: the same rules as [`Self::new`].
@@ -106,14 +149,6 @@ impl PointRecord {
         finite("radius", &[self.radius])?;
         if self.radius <= 0.0 {
             return Err(InvalidPoint::Radius);
-        }
-        for value in self.front_radiance.iter().chain(&self.back_radiance) {
-            if !value.is_finite() {
-                return Err(InvalidPoint::NotFinite("radiance"));
-            }
-            if value.to_f32() < 0.0 {
-                return Err(InvalidPoint::NegativeRadiance);
-            }
         }
         Ok(())
     }
@@ -134,9 +169,25 @@ impl PointRecord {
     #[inline]
     pub fn sides(&self) -> Sides {
         Sides {
-            front: self.front_radiance.map(f16::to_f32),
-            back: self.back_radiance.map(f16::to_f32),
+            front: rgb9e5::decode(self.front_code),
+            back: rgb9e5::decode(self.back_code),
         }
+    }
+
+    /// How it reflects.
+    #[inline]
+    pub fn reflectance(&self) -> Reflectance {
+        let channel = |shift: u32| (self.albedo_code >> shift & ALBEDO_MAX) as f32 / ALBEDO_MAX as f32;
+        Reflectance {
+            albedo: [0, ALBEDO_BITS, 2 * ALBEDO_BITS].map(channel),
+            both_sides: self.albedo_code & BOTH_SIDES_BIT != 0,
+        }
+    }
+
+    /// Whether it reflects anything.
+    #[inline]
+    pub fn reflects(&self) -> bool {
+        self.albedo_code != 0
     }
 }
 
@@ -195,10 +246,33 @@ mod tests {
             front: [1e6, 1.0, 0.0],
             back: [0.0; 3],
         };
-        assert!(PointRecord::clamps(&sides));
         let point = PointRecord::new([0.0; 3], [0.0, 1.0, 0.0], 1.0, sides).unwrap();
-        assert_eq!(point.sides().front, [HALF_MAX, 1.0, 0.0]);
+        assert!(point.is_clamped());
+        assert_eq!(point.sides().front, [RGB9E5_MAX, 0.0, 0.0], "nothing shows beside it");
         point.validate().unwrap();
+        assert!(!point.with_sides(Sides::default()).is_clamped());
+    }
+
+    #[test]
+    fn reflectance_comes_back() {
+        let point = PointRecord::new([0.0; 3], [0.0, 1.0, 0.0], 1.0, Sides::default()).unwrap();
+        assert!(!point.reflects());
+        for both_sides in [false, true] {
+            let given = Reflectance {
+                albedo: [0.0, 0.18, 1.0],
+                both_sides,
+            };
+            let found = point.with_reflectance(given).reflectance();
+            assert_eq!(found.both_sides, both_sides);
+            for (a, b) in given.albedo.into_iter().zip(found.albedo) {
+                assert!((a - b).abs() < 5e-4);
+            }
+        }
+        let beyond = Reflectance {
+            albedo: [2.0, -1.0, f32::NAN],
+            both_sides: false,
+        };
+        assert_eq!(point.with_reflectance(beyond).reflectance().albedo, [1.0, 0.0, 0.0]);
     }
 
     #[test]

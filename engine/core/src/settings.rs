@@ -102,6 +102,8 @@ pub struct ShadeSettings {
     pub falloff: f32,
     /// Surfaces that a receiver lies on are those within this fraction of a point radius (`bias`, made relative).
     pub bias: f32,
+    /// How often light is reflected on its way at most (`bounces`). More than once takes a scene of its own for every bounce.
+    pub bounces: u32,
 }
 
 impl Default for ShadeSettings {
@@ -112,6 +114,7 @@ impl Default for ShadeSettings {
             max_dist: f32::INFINITY,
             falloff: 0.0,
             bias: 0.1,
+            bounces: 1,
         }
     }
 }
@@ -156,6 +159,13 @@ impl ShadeSettings {
             "bias",
             self.bias,
             "from 0 to 1 point radii",
+        )?;
+        let bounces = 1..=limits::BOUNCES_MAX;
+        check(
+            bounces.contains(&self.bounces),
+            "bounces",
+            self.bounces,
+            format!("{bounces:?}"),
         )
     }
 }

@@ -4,7 +4,7 @@
 //! their lights with shadow rays, clouds ([`cloud`]: PLY, LAS, LAZ, COPC, PTC, built scenes) are read as they are, with
 //! normals and radii estimated where they have none. [`GBuffer`] says what a camera sees, rendered from a
 //! mesh or read from another renderer's EXR passes. [`bake`] gives the points of a cloud what was shaded
-//! at them. [`image`] writes the pictures. [`demo`] makes a scene on the spot, [`procedural`] one of any
+//! at them, [`bounce`] gives it back to the points of the scene itself. [`image`] writes the pictures. [`demo`] makes a scene on the spot, [`procedural`] one of any
 //! size.
 //!
 //! World space is the file's, y up; radiance is linear, W/(m2 sr). Nothing here keeps all points in memory. This crate does
@@ -12,6 +12,7 @@
 #![forbid(unsafe_code)]
 
 pub mod bake;
+pub mod bounce;
 pub mod camera;
 pub mod cloud;
 pub mod demo;
@@ -44,6 +45,7 @@ pub use crate::image::{
     write_png,
 };
 pub use bake::{BakeChannel, BakeOptions, Baked, BakedValues, LasForm, Receiver, Receivers, check_bake, write_baked};
+pub use bounce::{BounceReceivers, BouncedPoints};
 pub use camera::Camera;
 pub use cloud::{CloudOptions, Facing, InvalidPoints, Radius};
 pub use error::PointsError;

@@ -13,6 +13,7 @@ use crate::supervisor::WorkerBirth;
 use pbgi_cache::{CacheCounters, SceneCounters, SegmentLayout};
 use pbgi_core::{Environment, NodeRecord, PageKind, PageNo, PointRecord, SceneInfo, Statistics};
 use pbgi_store::SceneShape;
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -514,12 +515,24 @@ impl Dispatcher {
     }
 
     /// Tells watchers how far a job is.
-    pub(crate) fn progress(&self, job: JobNo, stage: &'static str, done: u64, total: u64) {
+    pub(crate) fn progress(&self, job: JobNo, stage: impl Into<Cow<'static, str>>, done: u64, total: u64) {
         if let Some(record) = self.lock().jobs.get(&job) {
             record
                 .status
                 .send_modify(|status| (status.stage, status.done, status.total) = (stage.into(), done, total));
         }
+    }
+
+    /// What is wanted of a job beside its task.
+    pub(crate) fn options_of(&self, job: JobNo) -> JobOptions {
+        let state = self.lock();
+        let record = state.jobs.get(&job);
+        record.map_or_else(JobOptions::default, |record| record.status.borrow().options.clone())
+    }
+
+    /// Adds a line to a job's history.
+    pub(crate) fn note(&self, job: JobNo, text: String) {
+        self.lock().note(job, text);
     }
 }
 

@@ -1,10 +1,11 @@
 //! Live sessions: opened by a client, fed with tiles, closed.
 
 use super::Dispatcher;
+use crate::bounce::{self, Wanted};
 use crate::error::{JobError, JobErrorKind};
 use crate::framebuffer::TileReceivers;
 use crate::limits;
-use crate::live::{Live, LiveResult, LiveTask, RECEIVER_BYTES};
+use crate::live::{Live, LiveResult, LiveTask, RECEIVER_BYTES, Session};
 use crate::roots::Want;
 use crate::scheduler::{DRAINING, Event, JobNo, Kind, Order};
 use crate::shade_job::{Counters, tile_statistics};
@@ -12,7 +13,7 @@ use pbgi_core::Statistics;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 
 impl Dispatcher {
     /// Opens a session. Its values come through the receiver, in whatever order they are done.
@@ -36,32 +37,66 @@ impl Dispatcher {
         if let Some(path) = &task.environment {
             self.roots().check("environment", path, Want::Read)?;
         }
-        let (this, paths) = (self.clone(), task.clone());
-        let opened = tokio::task::spawn_blocking(move || {
-            let mounted = this.open_scene(&paths.scene)?;
-            let environment = paths.environment.map(|path| this.read_environment(&path)).transpose()?;
-            Ok::<_, JobError>((mounted, environment))
-        });
-        let opened = opened
+        let (this, path) = (self.clone(), task.environment.clone());
+        let read = tokio::task::spawn_blocking(move || path.map(|path| this.read_environment(&path)).transpose());
+        let read = read
             .await
             .map_err(|error| JobError::new(JobErrorKind::Internal, error.to_string()))?;
-        let (mounted, environment) = opened?;
+        let number = {
+            let mut state = self.lock();
+            if state.lives.len() >= limits::LIVE_SESSIONS_MAX {
+                let text = format!("{} clients are streaming already", limits::LIVE_SESSIONS_MAX);
+                return Err(JobError::new(JobErrorKind::Exhausted, text));
+            }
+            state.number_last += 1;
+            JobNo(state.number_last)
+        };
+        let wanted = Wanted {
+            scene: task.scene,
+            settings: task.settings,
+            environment: read?,
+            user: task.user.clone(),
+            priority: task.priority,
+            workers: task.workers,
+        };
+        // Dropped with this call, when its client leaves: nothing is made for nobody.
+        let (_abort, aborted) = watch::channel(false);
+        let mounted = bounce::lit_scene(self, number, &wanted, &aborted).await?;
+        self.start_live(Session {
+            mounted,
+            settings: task.settings,
+            environment: wanted.environment,
+            user: task.user,
+            priority: task.priority,
+            pixel_angle: task.pixel_angle,
+        })
+    }
+
+    /// Starts a session on a scene that is open.
+    ///
+    /// # Errors
+    /// The daemon stops.
+    pub(crate) fn start_live(
+        self: &Arc<Self>,
+        session: Session,
+    ) -> Result<(JobNo, mpsc::Receiver<LiveResult>), JobError> {
         let (results, values) = mpsc::channel(limits::LIVE_TILES_MAX + 1);
         let mut state = self.lock();
         if state.draining {
             return Err(JobError::new(JobErrorKind::Unavailable, DRAINING));
         }
-        if state.lives.len() >= limits::LIVE_SESSIONS_MAX {
-            let text = format!("{} clients are streaming already", limits::LIVE_SESSIONS_MAX);
-            return Err(JobError::new(JobErrorKind::Exhausted, text));
-        }
         state.number_last += 1;
         let (job, kind) = (JobNo(state.number_last), Kind::Live);
+        let order = Order {
+            priority: session.priority,
+            user: super::durable::user_number(&session.user),
+            ..Order::default()
+        };
         let live = Live {
-            mounted,
-            settings: task.settings,
-            environment,
-            pixel_angle: task.pixel_angle,
+            mounted: session.mounted,
+            settings: session.settings,
+            environment: session.environment,
+            pixel_angle: session.pixel_angle,
             tiles: BTreeMap::new(),
             counters: Counters::default(),
             receivers: 0,
@@ -70,11 +105,6 @@ impl Dispatcher {
             results,
         };
         state.lives.insert(job, live);
-        let order = Order {
-            priority: task.priority,
-            user: super::durable::user_number(&task.user),
-            ..Order::default()
-        };
         self.enqueue(&mut state, Event::Submit { job, kind, order });
         Ok((job, values))
     }

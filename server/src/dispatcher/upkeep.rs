@@ -77,6 +77,10 @@ impl Dispatcher {
         self.lock().build_pids.insert(job, pid);
     }
 
+    pub(crate) fn build_ended(&self, job: JobNo) {
+        self.lock().build_pids.remove(&job);
+    }
+
     /// Nothing new is begun from now on; what is leased is finished.
     pub fn drain(self: &Arc<Self>) {
         let mut state = self.lock();

@@ -100,6 +100,7 @@ fn cloud(given: v1::CloudSettings) -> Result<CloudOptions, JobError> {
             v1::cloud_settings::Radius::EstimateRadius(estimate) => estimate.then_some(Radius::Estimate),
             v1::cloud_settings::Radius::FixedRadius(radius) => Some(Radius::Fixed(radius)),
         }),
+        albedo: given.albedo,
     })
 }
 
@@ -126,6 +127,7 @@ pub(super) fn shade_settings(settings: Option<v1::ShadeSettings>) -> ShadeSettin
         max_dist: given.max_dist.unwrap_or(default.max_dist),
         falloff: given.falloff.unwrap_or(default.falloff),
         bias: given.bias.unwrap_or(default.bias),
+        bounces: given.bounces.unwrap_or(default.bounces),
     }
 }
 
@@ -225,6 +227,8 @@ pub(super) fn task(task: &TaskInfo) -> v1::Task {
             max_dist: Some(settings.max_dist),
             falloff: Some(settings.falloff),
             bias: Some(settings.bias),
+            // Done before: the scene's points carry the others.
+            bounces: None,
         }),
         environment_width: task.environment.as_ref().map_or(0, |environment| environment.width()),
         environment_height: task.environment.as_ref().map_or(0, |environment| environment.height()),

@@ -59,7 +59,10 @@ impl ShadeService for LiveShading {
             user,
             priority: start.priority.unwrap_or(limits::PRIORITY_MAX),
             pixel_angle: start.rays.map(|rays| rays.pixel_angle),
+            workers: (start.workers > 0).then_some(start.workers as usize),
         };
+        let workers = task.workers.unwrap_or(limits::LIVE_TILES_MAX);
+        let tiles_max = workers.min(limits::LIVE_TILES_MAX);
         let (job, values) = self.dispatcher.open_live(task).await.map_err(status)?;
         let (answers, stream) = mpsc::channel(ANSWERS_MAX);
         let session = Session {
@@ -71,10 +74,7 @@ impl ShadeService for LiveShading {
             done: BTreeMap::new(),
             tile_next: 0,
             answer_next: 0,
-            tiles_max: match start.workers {
-                0 => limits::LIVE_TILES_MAX,
-                workers => (workers as usize).min(limits::LIVE_TILES_MAX),
-            },
+            tiles_max,
             reports: start.report,
         };
         tokio::spawn(session.run(requests, receivers));

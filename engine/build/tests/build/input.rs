@@ -35,7 +35,7 @@ fn points_outside_the_declared_bounds_are_counted_and_the_first_is_named() {
 
 #[test]
 fn invalid_points_are_counted_and_the_first_is_named() {
-    for field in 0..11 {
+    for field in 0..5 {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0] {
             let mut points = sheet(3000);
             let broken = &mut points[1234];
@@ -44,8 +44,6 @@ fn invalid_points_are_counted_and_the_first_is_named() {
                 0..3 if bad == -1.0 => continue,
                 0..3 => broken.position[field] = bad,
                 3 => broken.radius = bad,
-                4..7 => broken.front_radiance[field - 4] = half::f16::from_f32(bad),
-                7..10 => broken.back_radiance[field - 7] = half::f16::from_f32(bad),
                 _ => broken.radius = 0.0,
             }
             for run_points in [usize::MAX, 1000] {

@@ -54,7 +54,7 @@ impl LasPoints {
         }
         Ok(Self {
             linear: linear_table(&first),
-            door: Door::new(path, count, options.invalid_points),
+            door: Door::new(path, count, options),
             bounds: (!options.recompute_bounds).then_some(bounds),
             path: path.to_owned(),
             decoded: None,

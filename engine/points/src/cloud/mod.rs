@@ -5,7 +5,7 @@ pub(crate) mod ptc;
 pub(crate) mod scene_points;
 
 use crate::error::PointsError;
-use half::f16;
+use pbgi_core::point::Reflectance;
 use pbgi_core::{InvalidPoint, PointRecord, PointStream};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -25,6 +25,8 @@ pub struct CloudOptions {
     pub estimate_normals: Option<Facing>,
     /// Where the radii of points come from whose file has none.
     pub radius: Option<Radius>,
+    /// Albedo of points that have none, 0 to 1, of both sides: without one they reflect nothing that other surfaces send.
+    pub albedo: Option<f32>,
 }
 
 /// What happens to points that cannot be used.
@@ -88,20 +90,16 @@ pub(crate) trait Cloud: PointStream<Error = PointsError> + Send {
 
 /// The point with its place in the file where its radiance was.
 fn numbered(point: PointRecord, place: u64) -> PointRecord {
-    let word = |index: u32| f16::from_bits((place >> (16 * index)) as u16);
     PointRecord {
-        front_radiance: [word(0), word(1), word(2)],
-        back_radiance: [word(3), f16::ZERO, f16::ZERO],
+        front_code: place as u32,
+        back_code: (place >> 32) as u32,
         ..point
     }
 }
 
 /// Place in its file of a point that a numbered cloud gave.
 pub(crate) fn place_of(point: &PointRecord) -> u64 {
-    let words = point.front_radiance.iter().chain(&point.back_radiance[..1]);
-    words
-        .rev()
-        .fold(0, |place, word| place << 16 | u64::from(word.to_bits()))
+    u64::from(point.back_code) << 32 | u64::from(point.front_code)
 }
 
 pub(crate) const NORMAL_PLACEHOLDER: [f32; 3] = [0.0, 1.0, 0.0];
@@ -117,12 +115,17 @@ pub(crate) struct Door {
     invalid: u64,
     first: Option<(u64, InvalidPoint)>,
     numbers: bool,
+    albedo: Option<Reflectance>,
 }
 
 impl Door {
-    pub(crate) fn new(path: &Path, count: u64, policy: InvalidPoints) -> Self {
+    pub(crate) fn new(path: &Path, count: u64, options: &CloudOptions) -> Self {
         Self {
-            policy,
+            policy: options.invalid_points,
+            albedo: options.albedo.map(|albedo| Reflectance {
+                albedo: [albedo; 3],
+                both_sides: true,
+            }),
             path: path.to_owned(),
             count,
             seen: 0,
@@ -142,7 +145,10 @@ impl Door {
     pub(crate) fn take(&mut self, point: Result<PointRecord, InvalidPoint>, batch: &mut Vec<PointRecord>) {
         match point {
             Ok(point) if self.numbers => batch.push(numbered(point, self.seen)),
-            Ok(point) => batch.push(point),
+            Ok(point) => batch.push(match self.albedo {
+                Some(reflectance) if !point.reflects() => point.with_reflectance(reflectance),
+                _ => point,
+            }),
             Err(reason) => self.turn_away(reason),
         }
         self.seen += 1;

@@ -69,7 +69,7 @@ impl PtcPoints {
             reader,
             layout,
             count,
-            door: Door::new(path, count, options.invalid_points),
+            door: Door::new(path, count, options),
             origin,
             takes_normals: options.estimate_normals.is_none(),
             buffer: Vec::new(),

@@ -21,7 +21,7 @@ impl ScenePoints {
         let info = scene.info();
         Ok(Self {
             page: vec![bytemuck::Zeroable::zeroed(); info.settings.points_per_page as usize],
-            door: Door::new(path, info.point_count, options.invalid_points),
+            door: Door::new(path, info.point_count, options),
             scene,
             next: 0,
             origin,

@@ -7,7 +7,7 @@ use crate::cloud::{
 };
 use crate::error::PointsError;
 use crate::limits;
-use pbgi_core::point::Sides;
+use pbgi_core::point::{Reflectance, Sides};
 use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
@@ -48,6 +48,8 @@ struct Fields {
     radius: Option<Field>,
     front: Option<Colour>,
     back: Option<Colour>,
+    albedo: Option<Colour>,
+    reflecting_sides: Option<Field>,
     encoding: Encoding,
 }
 
@@ -117,7 +119,7 @@ impl PlyPoints {
             declared: header.bounds.filter(|_| !options.recompute_bounds).map(moved),
             origin,
             positioned: false,
-            door: Door::new(path, vertex.count, options.invalid_points),
+            door: Door::new(path, vertex.count, options),
             vertex,
             buffer: Vec::new(),
             values: Vec::new(),
@@ -432,13 +434,15 @@ impl Fields {
             radius: find("radius"),
             front: colour(["red", "green", "blue"])?,
             back: colour(["back_red", "back_green", "back_blue"])?,
+            albedo: colour(["albedo_red", "albedo_green", "albedo_blue"])?,
+            reflecting_sides: find("reflecting_sides"),
             encoding,
         })
     }
 
     fn are_little_floats(&self) -> bool {
         let triples = [Some(self.position), self.normal];
-        let colours = [&self.front, &self.back]
+        let colours = [&self.front, &self.back, &self.albedo]
             .into_iter()
             .flatten()
             .map(|colour| colour.fields);
@@ -447,7 +451,8 @@ impl Fields {
             .flatten()
             .chain(colours)
             .flatten()
-            .chain(self.radius);
+            .chain(self.radius)
+            .chain(self.reflecting_sides);
         self.encoding == Encoding::LittleEndian && fields.all(|field| field.scalar == Scalar::F32)
     }
 
@@ -476,7 +481,12 @@ impl Fields {
             (None, None) => front,
             (back, _) => colour(back),
         };
-        PointRecord::new(position, normal, radius, Sides { front, back })
+        let reflectance = Reflectance {
+            albedo: colour(&self.albedo),
+            both_sides: self.reflecting_sides.as_ref().is_none_or(|field| number(field) != 1.0),
+        };
+        let point = PointRecord::new(position, normal, radius, Sides { front, back })?;
+        Ok(point.with_reflectance(reflectance))
     }
 }
 

@@ -9,7 +9,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 /// Numbers of a point of [`PlyForm::Floats`], in file order.
-const FLOAT_PROPERTIES: [&str; 13] = [
+const FLOAT_PROPERTIES: [&str; 17] = [
     "x",
     "y",
     "z",
@@ -23,12 +23,16 @@ const FLOAT_PROPERTIES: [&str; 13] = [
     "back_red",
     "back_green",
     "back_blue",
+    "albedo_red",
+    "albedo_green",
+    "albedo_blue",
+    "reflecting_sides",
 ];
 
 /// How points are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlyForm {
-    /// 13 floats, 52 bytes: for any tool that reads PLY.
+    /// 17 floats, 68 bytes: for any tool that reads PLY.
     Floats,
     /// The 32 bytes of a point record: what a build reads fastest, without loss.
     Records,
@@ -78,7 +82,17 @@ impl PlyWriter {
             PlyForm::Records => self.row.extend_from_slice(bytemuck::bytes_of(point)),
             PlyForm::Floats => {
                 let (normal, sides) = (point.normal().to_array(), point.sides());
-                let numbers = [&point.position[..], &normal, &[point.radius], &sides.front, &sides.back];
+                let reflectance = point.reflectance();
+                let reflecting = [if reflectance.both_sides { 2.0 } else { 1.0 }];
+                let numbers = [
+                    &point.position[..],
+                    &normal,
+                    &[point.radius],
+                    &sides.front,
+                    &sides.back,
+                    &reflectance.albedo,
+                    &reflecting,
+                ];
                 let bytes = numbers.into_iter().flatten().flat_map(|number| number.to_le_bytes());
                 self.row.extend(bytes);
             }

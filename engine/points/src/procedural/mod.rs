@@ -10,7 +10,7 @@ use crate::glb::{GlbMesh, GlbScene};
 use crate::limits;
 use crate::output::write_file;
 use glam::Vec3;
-use pbgi_core::point::Sides;
+use pbgi_core::point::{Reflectance, Sides};
 use pbgi_core::{Bounds, PointRecord, PointStream};
 use serde_json::json;
 use shapes::{Material, Patch, Random};
@@ -171,6 +171,10 @@ impl ProceduralScene {
             front: radiance(patch.material, normal),
             back: radiance(patch.material, -normal),
         };
+        let reflectance = Reflectance {
+            albedo: patch.material.albedo(),
+            both_sides: true,
+        };
         let (low, high) = (Vec3::from(self.bounds.min), Vec3::from(self.bounds.max));
         for row in 0..rows {
             let columns = (row + 1) * count / rows - row * count / rows;
@@ -180,7 +184,7 @@ impl ProceduralScene {
                 let position = (patch.corner + patch.u * u + patch.v * v).clamp(low, high);
                 let point = PointRecord::new(position.to_array(), normal.to_array(), radius, sides);
                 let unusable = |error| PointsError::Request(format!("a generated point is unusable: {error}"));
-                batch.push(point.map_err(unusable)?);
+                batch.push(point.map_err(unusable)?.with_reflectance(reflectance));
             }
         }
         Ok(())

@@ -10,7 +10,7 @@ use crate::scene::MeshScene;
 use density::{Sizes, View};
 use glam::Vec3;
 use layout::{Layout, Surfel};
-use pbgi_core::point::Sides;
+use pbgi_core::point::{Reflectance, Sides};
 use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream};
 use std::f32::consts::PI;
 use std::sync::{Mutex, PoisonError};
@@ -19,8 +19,8 @@ use std::sync::{Mutex, PoisonError};
 ///
 /// Each stands for the same area (on curved surfaces up to 5 % more), or for one that a camera asks for, and carries, for either side, the radiance
 /// `albedo E / pi + emission` that leaves it: E from the punctual lights, shadowed; emission on the front, and on the back of
-/// double-sided materials. Both sides of every surface receive and block light, whatever the material says. Normals are
-/// geometric. Where a texture cuts the surface out there are no points.
+/// double-sided materials. Both sides of every surface receive and block direct light, whatever the material says; light of other
+/// surfaces is reflected by the backs of double-sided materials only, as nobody sees the others. Normals are geometric. Where a texture cuts the surface out there are no points.
 pub struct MeshPoints {
     scene: MeshScene,
     sizes: Sizes,
@@ -106,7 +106,12 @@ impl MeshPoints {
         let bounds = scene.bounds();
         // Rounding may put a point a hair outside of the box that promises to hold it.
         let position = surfel.position.clamp(bounds.min.into(), bounds.max.into());
-        PointRecord::new(position.to_array(), surfel.normal.to_array(), surfel.radius, sides).map(Some)
+        let reflectance = Reflectance {
+            albedo: look.albedo.to_array(),
+            both_sides: look.double_sided,
+        };
+        let point = PointRecord::new(position.to_array(), surfel.normal.to_array(), surfel.radius, sides)?;
+        Ok(Some(point.with_reflectance(reflectance)))
     }
 
     /// Lights all surfels; the order is theirs.
