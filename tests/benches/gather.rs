@@ -8,10 +8,11 @@
 
 use glam::Vec3;
 use pbgi_build::{BuildRequest, build};
-use pbgi_core::{BuildSettings, PageKind, PageNo, SceneInfo, ShadeSettings};
+use pbgi_core::{BuildSettings, SceneInfo, ShadeSettings};
 use pbgi_points::{Camera, Density, GBuffer, InputOptions, Kind, MeshScene, ProceduralScene, open_input};
 use pbgi_shade::{ArraySource, Receiver, Shaded, Shader};
-use pbgi_store::{Overwrite, Scene};
+use pbgi_store::Overwrite;
+use pbgi_tests::load;
 use std::f32::consts::{PI, TAU};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -101,26 +102,6 @@ impl Truth {
 
 fn mean(rgb: [f32; 3]) -> f32 {
     (rgb[0] + rgb[1] + rgb[2]) / 3.0
-}
-
-/// A built scene as plain arrays.
-fn load(path: &Path) -> (SceneInfo, ArraySource) {
-    let scene = Scene::open(path).unwrap();
-    let info = scene.info().clone();
-    let mut source = ArraySource::default();
-    for kind in [PageKind::Node, PageKind::Point] {
-        let mut page = vec![0u64; info.page_bytes(kind).div_ceil(8)];
-        for number in 0..info.page_count(kind) {
-            let bytes: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut page)[..info.page_bytes(kind)];
-            scene.read_page(kind, PageNo(number as u32), bytes).unwrap();
-            match kind {
-                PageKind::Node => source.nodes.extend_from_slice(bytemuck::cast_slice(bytes)),
-                PageKind::Point => source.points.extend_from_slice(bytemuck::cast_slice(bytes)),
-            }
-        }
-    }
-    source.points.truncate(info.point_count as usize);
-    (info, source)
 }
 
 /// Receivers in whole groups, spread over the picture.

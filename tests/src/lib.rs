@@ -19,7 +19,7 @@ pub use disk::forget;
 pub use house::{DAEMON, House, Job, PATIENCE, Run, program, signal, wait_for, workspace_root};
 pub use nix::sys::signal::Signal;
 pub use picture::{Picture, SHADED, assert_same, assert_same_values, relative_rms, rms};
-pub use scene::{flip_bit, page_count};
+pub use scene::{flip_bit, load, page_count};
 
 use std::path::PathBuf;
 

@@ -1,5 +1,7 @@
-//! Scene folders as bytes: how many pages they have, and how to spoil one.
+//! Scene folders: how many pages they have, how to spoil one, all of one in memory.
 
+use pbgi_core::{PageKind, PageNo, SceneInfo};
+use pbgi_shade::ArraySource;
 use pbgi_store::Scene;
 use std::fs::OpenOptions;
 use std::os::unix::fs::FileExt;
@@ -38,4 +40,24 @@ pub fn flip_bit(scene: &Path, file: &str, page: u64) {
     file.read_exact_at(&mut byte, offset).unwrap();
     byte[0] ^= 0x10;
     file.write_all_at(&byte, offset).unwrap();
+}
+
+/// A built scene as plain arrays.
+pub fn load(path: &Path) -> (SceneInfo, ArraySource) {
+    let scene = Scene::open(path).unwrap();
+    let info = scene.info().clone();
+    let mut source = ArraySource::default();
+    for kind in [PageKind::Node, PageKind::Point] {
+        let mut page = vec![0u64; info.page_bytes(kind).div_ceil(8)];
+        for number in 0..info.page_count(kind) {
+            let bytes: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut page)[..info.page_bytes(kind)];
+            scene.read_page(kind, PageNo(number as u32), bytes).unwrap();
+            match kind {
+                PageKind::Node => source.nodes.extend_from_slice(bytemuck::cast_slice(bytes)),
+                PageKind::Point => source.points.extend_from_slice(bytemuck::cast_slice(bytes)),
+            }
+        }
+    }
+    source.points.truncate(info.point_count as usize);
+    (info, source)
 }
