@@ -120,6 +120,7 @@ fn wire_shade_settings(settings: &ShadeSettings) -> v1::ShadeSettings {
         falloff: Some(settings.falloff),
         bias: Some(settings.bias),
         bounces: Some(settings.bounces),
+        interpolation: Some(settings.interpolation),
     }
 }
 

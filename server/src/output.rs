@@ -119,6 +119,7 @@ fn layered(picture: &Picture, planes: Planes) -> Result<LayeredImage, String> {
     set("falloff", settings.falloff.to_string());
     set("bias", settings.bias.to_string());
     set("bounces", settings.bounces.to_string());
+    set("interpolation", settings.interpolation.to_string());
     if let Some(environment) = &task.environment {
         set("environment", name(environment));
     }

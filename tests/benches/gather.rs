@@ -26,15 +26,17 @@ const GROUP: u32 = 8;
 const GROUP_STEP: u32 = 61;
 /// Rays of each of the two references, along one edge of their grid.
 const REFERENCE_SIDE: u32 = 32;
-/// Settings of the gather: solid angle of a cut element, raster resolution.
-const SETTINGS: [(f32, u32); 7] = [
-    (0.5, 32),
-    (0.2, 32),
-    (0.1, 32),
-    (0.05, 32),
-    (0.1, 64),
-    (0.05, 64),
-    (0.02, 64),
+/// Settings of the gather: solid angle of a cut element, raster resolution, error of interpolation.
+const SETTINGS: [(f32, u32, f32); 9] = [
+    (0.5, 32, 0.0),
+    (0.2, 32, 0.0),
+    (0.2, 32, 0.02),
+    (0.1, 32, 0.0),
+    (0.05, 32, 0.0),
+    (0.1, 64, 0.0),
+    (0.05, 64, 0.0),
+    (0.05, 64, 0.02),
+    (0.02, 64, 0.0),
 ];
 /// Rays along one edge of the grid.
 const RAY_SIDES: [u32; 4] = [4, 8, 16, 32];
@@ -128,11 +130,12 @@ fn gather_row(
     source: &mut ArraySource,
     groups: &[Vec<Receiver>],
     truth: &Truth,
-    row: (f32, u32),
+    row: (f32, u32, f32),
 ) -> Row {
     let settings = ShadeSettings {
         max_solid_angle: row.0,
         raster_resolution: row.1,
+        interpolation: row.2,
         ..ShadeSettings::default()
     };
     let mut shader = Shader::new(info, settings, None).unwrap();
@@ -161,7 +164,10 @@ fn gather_row(
     let (occlusion, irradiance) = truth.errors(&estimates);
     let count = counters.receivers as f64;
     Row {
-        what: format!("gather, solid angle {}, raster {}", row.0, row.1),
+        what: match row.2 {
+            0.0 => format!("gather, solid angle {}, raster {}", row.0, row.1),
+            error => format!("gather, {}, {}, interpolated {error}", row.0, row.1),
+        },
         micros: best * 1e6 / count,
         occlusion,
         irradiance,

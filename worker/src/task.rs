@@ -104,6 +104,7 @@ fn shade_settings(wire: Option<&v1::ShadeSettings>) -> Result<ShadeSettings, Str
         max_dist: wire.max_dist.unwrap_or(default.max_dist),
         falloff: wire.falloff.unwrap_or(default.falloff),
         bias: wire.bias.unwrap_or(default.bias),
+        interpolation: wire.interpolation.unwrap_or(default.interpolation),
         ..default
     };
     settings.validate().map_err(|error| error.to_string())?;

@@ -104,6 +104,9 @@ pub struct ShadeSettings {
     pub bias: f32,
     /// How often light is reflected on its way at most (`bounces`). More than once takes a scene of its own for every bounce.
     pub bounces: u32,
+    /// Error within which receivers may be given what their neighbours on the same surface tell: of occlusion, and of irradiance
+    /// over that of the neighbours. 0 shades all.
+    pub interpolation: f32,
 }
 
 impl Default for ShadeSettings {
@@ -115,6 +118,7 @@ impl Default for ShadeSettings {
             falloff: 0.0,
             bias: 0.1,
             bounces: 1,
+            interpolation: 0.0,
         }
     }
 }
@@ -166,6 +170,12 @@ impl ShadeSettings {
             "bounces",
             self.bounces,
             format!("{bounces:?}"),
+        )?;
+        check(
+            (0.0..=0.5).contains(&self.interpolation),
+            "interpolation",
+            self.interpolation,
+            "from 0 to 0.5",
         )
     }
 }

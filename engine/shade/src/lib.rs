@@ -11,6 +11,7 @@ mod cut;
 mod environment;
 mod footprint;
 mod frame;
+mod interpolate;
 mod leaf;
 mod painter;
 mod primary;

@@ -3,6 +3,7 @@
 use crate::cut::{Pack, Scratch, Walk, gather};
 use crate::environment::ProbeMap;
 use crate::frame::Frame;
+use crate::interpolate::patches;
 use crate::raster::{Raster, RasterTables, bent_normal, for_each_open};
 use crate::simd::{Floats, LANES, Simd, Task};
 use crate::source::{SceneSource, SourceError};
@@ -36,7 +37,7 @@ pub struct Shaded {
 /// Work done so far, summed over receivers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ShadeCounters {
-    /// Receivers shaded, holes not counted.
+    /// Receivers shaded or interpolated, holes not counted.
     pub receivers: u64,
     /// Clusters and discs rastered.
     pub cut_elements: u64,
@@ -128,7 +129,57 @@ impl Shader {
             });
         }
         results.fill(Shaded::default());
-        order_receivers(receivers, &mut self.order);
+        let mut order = std::mem::take(&mut self.order);
+        order_receivers(receivers, &mut order);
+        let done = if self.settings.interpolation > 0.0 {
+            self.interpolate(receivers, &order, source, results)
+        } else {
+            self.shade(receivers, &order, source, results)
+        };
+        self.counters.receivers += order.len() as u64;
+        self.order = order;
+        done
+    }
+
+    /// Shades some receivers, and lets the others have what these tell.
+    fn interpolate<S: SceneSource>(
+        &mut self,
+        receivers: &[Receiver],
+        order: &[(u64, u32)],
+        source: &mut S,
+        results: &mut [Shaded],
+    ) -> Result<(), ShadeError> {
+        let mut shaded = vec![false; receivers.len()];
+        let mut wanted = Vec::new();
+        let mut level = patches(receivers, order);
+        while !level.is_empty() {
+            wanted.clear();
+            level.iter().for_each(|patch| patch.wanted(&shaded, &mut wanted));
+            for &index in &wanted {
+                shaded[index as usize] = true;
+            }
+            let now: Vec<(u64, u32)> = order
+                .iter()
+                .filter(|(_, index)| wanted.contains(index))
+                .copied()
+                .collect();
+            self.shade(receivers, &now, source, results)?;
+            let error = self.settings.interpolation;
+            let halves = level
+                .drain(..)
+                .filter_map(|patch| patch.fill(receivers, &shaded, error, results));
+            level = halves.flatten().collect();
+        }
+        Ok(())
+    }
+
+    fn shade<S: SceneSource>(
+        &mut self,
+        receivers: &[Receiver],
+        order: &[(u64, u32)],
+        source: &mut S,
+        results: &mut [Shaded],
+    ) -> Result<(), ShadeError> {
         let group = Group {
             walk: Walk {
                 info: &self.info,
@@ -137,7 +188,7 @@ impl Shader {
             },
             probe: self.probe.as_ref(),
             receivers,
-            order: &self.order,
+            order,
             source,
             results,
             scratch: &mut self.scratch,
@@ -224,7 +275,6 @@ impl<S: SceneSource> Group<'_, S> {
             let pack = Pack::new(self.walk.info, receivers, &frames);
             self.source.begin_pack();
             let seen = gather(&self.walk, &pack, self.source, &mut raster, self.scratch, self.counters)?;
-            self.counters.receivers += receivers.len() as u64;
             let (x, y, z) = (
                 seen.radiance.x.to_array(),
                 seen.radiance.y.to_array(),

@@ -6,7 +6,7 @@
 mod support;
 
 use pbgi_core::ShadeSettings;
-use pbgi_shade::{Shaded, Shader};
+use pbgi_shade::{Receiver, Shaded, Shader};
 use std::f32::consts::PI;
 use support::truth::Truth;
 
@@ -101,4 +101,52 @@ fn what_a_receiver_gets_does_not_depend_on_its_company() {
         shader.shade_group(receiver, &mut source, shaded).unwrap();
     }
     assert_eq!(together, alone);
+}
+
+#[test]
+fn interpolation_saves_receivers_and_keeps_its_error() {
+    const ERROR: f32 = 0.02;
+    let truth = Truth::city();
+    let (info, mut source) = support::build(&truth.points(200_000));
+    // Groups as pictures have them: eight by eight, on walls, roofs and the street, and across their edges.
+    let spots = truth.receivers(40);
+    let groups = spots.chunks(1).map(|spot| {
+        let (u, v) = spot[0].normal.any_orthonormal_pair();
+        let place = |i: usize| spot[0].position + (u * (i % 8) as f32 + v * (i / 8) as f32) * 0.02;
+        (0..64)
+            .map(|i| Receiver {
+                position: place(i),
+                normal: spot[0].normal,
+            })
+            .collect::<Vec<_>>()
+    });
+    let shade = |interpolation: f32, group: &[Receiver], source: &mut _| {
+        let settings = ShadeSettings {
+            interpolation,
+            ..ShadeSettings::default()
+        };
+        let mut shader = Shader::new(&info, settings, None).unwrap();
+        let mut shaded = vec![Shaded::default(); group.len()];
+        shader.shade_group(group, source, &mut shaded).unwrap();
+        (shaded, shader.counters())
+    };
+    let (mut work, mut work_saved, mut square, mut count) = (0, 0, 0.0, 0.0);
+    for group in groups {
+        let (all, spent) = shade(0.0, &group, &mut source);
+        let (some, saved) = shade(ERROR, &group, &mut source);
+        assert_eq!(spent.receivers, saved.receivers);
+        work += spent.cut_elements;
+        work_saved += saved.cut_elements;
+        for (a, b) in all.iter().zip(&some) {
+            square += f64::from((a.occlusion - b.occlusion).powi(2));
+            count += 1.0;
+        }
+    }
+    let rms = (square / count).sqrt();
+    println!(
+        "interpolation within {ERROR}: occlusion off by {rms:.4} (RMS), {:.2} of the work",
+        work_saved as f64 / work as f64
+    );
+    assert!(rms < f64::from(ERROR), "{rms}");
+    assert!(work_saved * 2 < work, "{work_saved} of {work}");
 }

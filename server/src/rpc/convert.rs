@@ -128,6 +128,7 @@ pub(super) fn shade_settings(settings: Option<v1::ShadeSettings>) -> ShadeSettin
         falloff: given.falloff.unwrap_or(default.falloff),
         bias: given.bias.unwrap_or(default.bias),
         bounces: given.bounces.unwrap_or(default.bounces),
+        interpolation: given.interpolation.unwrap_or(default.interpolation),
     }
 }
 
@@ -229,6 +230,7 @@ pub(super) fn task(task: &TaskInfo) -> v1::Task {
             bias: Some(settings.bias),
             // Done before: the scene's points carry the others.
             bounces: None,
+            interpolation: Some(settings.interpolation),
         }),
         environment_width: task.environment.as_ref().map_or(0, |environment| environment.width()),
         environment_height: task.environment.as_ref().map_or(0, |environment| environment.height()),
