@@ -236,6 +236,7 @@ impl<'a> PageSource<'a> {
         let count = (file.records - u64::from(first)).min(u64::from(file.records_per_page)) as u32;
         if self.pages.cache.get(key).is_none() {
             self.load(key)?;
+            self.pages.cache.get(key);
         }
         let before = self.places[kind as usize].filter(|place| place.key == key);
         let place = Place {
@@ -283,7 +284,7 @@ impl<'a> PageSource<'a> {
     /// The bytes of the records `range` (within the page) of a page that `place` pinned.
     #[inline]
     fn bytes(&mut self, place: Place, start: usize, end: usize) -> Result<&[u8], SourceError> {
-        let frame = self.pages.cache.get(place.key);
+        let frame = self.pages.cache.again(place.key);
         let bytes = frame.and_then(|frame| frame.get(start..end));
         bytes.ok_or_else(|| lost(place))
     }

@@ -209,11 +209,11 @@ impl<'a> Cluster<'a> {
 fn bands<F: Floats>(terms: &[f32; 4 * SH_TERMS], y: &[F; SH_TERMS], channel: usize) -> [F; 2] {
     let (mut even, mut odd) = (F::splat(0.0), F::splat(0.0));
     for (term, y) in y.iter().enumerate() {
-        let add = F::splat(terms[term * 4 + channel]) * *y;
+        let factor = F::splat(terms[term * 4 + channel]);
         if (1..4).contains(&term) {
-            odd = odd + add;
+            odd = factor.mul_add(*y, odd);
         } else {
-            even = even + add;
+            even = factor.mul_add(*y, even);
         }
     }
     [even, odd]
@@ -273,9 +273,9 @@ fn quadratic_form(m: &[f32; 6], v: Vec3) -> f32 {
 fn multiply<F: Floats>(m: &[f32; 6], v: Vector<F>) -> Vector<F> {
     let [xx, yy, zz, xy, xz, yz] = m.map(F::splat);
     Vector {
-        x: xx * v.x + xy * v.y + xz * v.z,
-        y: xy * v.x + yy * v.y + yz * v.z,
-        z: xz * v.x + yz * v.y + zz * v.z,
+        x: xx.mul_add(v.x, xy.mul_add(v.y, xz * v.z)),
+        y: xy.mul_add(v.x, yy.mul_add(v.y, yz * v.z)),
+        z: xz.mul_add(v.x, yz.mul_add(v.y, zz * v.z)),
     }
 }
 

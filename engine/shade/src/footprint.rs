@@ -20,8 +20,9 @@ const OCTAGON_REACH: f32 = 1.06;
 pub(crate) struct HalfSpace<F: Floats> {
     pub(crate) y: F,
     pub(crate) z: F,
-    /// Negative where the bound is an upper one.
-    pub(crate) sign: F::Words,
+    /// All ones where the bound is an upper one, and where it is a lower one.
+    pub(crate) upper: F::Words,
+    pub(crate) lower: F::Words,
 }
 
 /// A convex cone with its apex at the receiver, in the receiver's frame.
@@ -65,7 +66,8 @@ impl<F: Floats> Footprint<F> {
         let none = HalfSpace {
             y: F::splat(0.0),
             z: F::splat(0.0),
-            sign: F::Words::splat(0),
+            upper: F::Words::splat(0),
+            lower: F::Words::splat(0),
         };
         Self {
             half_spaces: [none; HALF_SPACES_MAX],
@@ -87,10 +89,12 @@ impl<F: Floats> Footprint<F> {
         let tiny = F::splat(TINY);
         let x = g.x.abs().less(tiny).select(tiny, g.x);
         let scale = F::splat(-1.0) / x;
+        let upper = x.less(F::splat(0.0));
         self.half_spaces[self.len] = HalfSpace {
             y: g.y * scale,
             z: g.z * scale,
-            sign: x.to_bits(),
+            upper,
+            lower: !upper,
         };
         self.len += 1;
     }
@@ -99,8 +103,8 @@ impl<F: Floats> Footprint<F> {
     #[inline(always)]
     fn add_slab(&mut self, plane: &Plane<F>, axis: Vector<F>, low: F, high: F) {
         let axis = axis * plane.distance;
-        self.add_half_space(axis - plane.normal * low);
-        self.add_half_space(plane.normal * high - axis);
+        self.add_half_space(plane.normal.mul_add(-low, axis));
+        self.add_half_space(plane.normal.mul_add(high, -axis));
     }
 
     /// A rectangle around `center` in a plane, given by unit axes and half extents; everything in the receivers' frames.
@@ -146,7 +150,7 @@ impl<F: Floats> Footprint<F> {
     /// Keeps the part with `normal.x >= distance`; in the receivers' frames.
     #[inline(always)]
     pub(crate) fn cut(&mut self, plane: &Plane<F>, normal: Vector<F>, distance: F) {
-        self.add_half_space(normal * plane.distance - plane.normal * distance);
+        self.add_half_space(plane.normal.mul_add(-distance, normal * plane.distance));
     }
 
     /// Rows that the footprint may touch in any of these lanes.

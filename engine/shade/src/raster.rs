@@ -156,9 +156,10 @@ impl<F: Floats, const WORDS: usize> Raster<F, WORDS> {
             let (sin, cos) = (F::splat(tables.row_sin[row]), F::splat(tables.row_cos[row]));
             let (mut low, mut high) = (near, far);
             for half_space in footprint.half_spaces() {
-                let bound = half_space.y * sin + half_space.z * cos;
-                low = half_space.sign.select(near, bound).max(low);
-                high = half_space.sign.select(bound, far).min(high);
+                let bound = half_space.y.mul_add(sin, half_space.z * cos).to_bits();
+                // All ones are no number, and lose every comparison.
+                low = (bound | half_space.upper).to_floats().max(low);
+                high = (bound | half_space.lower).to_floats().min(high);
             }
             let met = low.less(high) & lanes;
             if met.lanes() == 0 {
@@ -167,6 +168,7 @@ impl<F: Floats, const WORDS: usize> Raster<F, WORDS> {
             let (first, end) = (column_of_tangent(low, resolution), column_of_tangent(high, resolution));
             length = length + met.select(end - first, F::splat(0.0));
             let (first, end) = (rounded(first), rounded(end));
+            drawn = drawn.wrapping_add(met & end.wrapping_sub(first).max_signed(zero));
             for (word, mask) in word_masks::<F, WORDS>(first, end).into_iter().enumerate() {
                 let mut mask = mask & met;
                 if let Some(density) = ink.density {
@@ -175,7 +177,6 @@ impl<F: Floats, const WORDS: usize> Raster<F, WORDS> {
                 let covered = &mut self.covered[row][word];
                 let newly = mask & !*covered;
                 *covered = *covered | mask;
-                drawn = drawn.wrapping_add(mask.count_ones());
                 count = count.wrapping_add(newly.count_ones());
                 if let Some(weight) = ink.weight {
                     let kept = newly & sparse_bits(!ink.seed ^ (row * WORDS + word) as u64, weight);
@@ -328,9 +329,9 @@ fn column<F: Floats>(sign: F, y: F, resolution: F) -> F {
     const FIT: [f32; 6] = [0.807_386_2, -5.911_842_5, 27.192_5, -45.278_4, 31.945_1, -8.254_766];
     let mut sum = F::splat(FIT[5]);
     for factor in FIT[..5].iter().rev() {
-        sum = sum * y + F::splat(*factor);
+        sum = sum.mul_add(y, F::splat(*factor));
     }
-    let half_share = F::splat(0.5) - y * y * y * sum;
+    let half_share = (-(y * y * y)).mul_add(sum, F::splat(0.5));
     (F::splat(0.5) + half_share.copysign(sign)) * resolution
 }
 

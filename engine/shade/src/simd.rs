@@ -1,7 +1,7 @@
 //! Eight numbers at a time: what the gather computes with, for AVX2 and for any processor, chosen at run time.
 //!
 //! A lane is a receiver. The gather is written once over [`Floats`]; [`Simd::dispatch`] compiles it twice. Both ways compute
-//! the same bits: every operation is a correctly rounded one of IEEE 754, none is contracted or reordered. This is the one
+//! the same bits: every operation is a correctly rounded one of IEEE 754, fused where it says so and nowhere else. This is the one
 //! place that names instruction sets.
 
 use crate::footprint::Footprint;
@@ -23,6 +23,8 @@ pub(crate) trait Floats:
     fn from_array(values: [f32; LANES]) -> Self;
     fn to_array(self) -> [f32; LANES];
     fn sqrt(self) -> Self;
+    /// `self * factor + term`, rounded once.
+    fn mul_add(self, factor: Self, term: Self) -> Self;
     /// The smaller; the second if either is not a number.
     fn min(self, other: Self) -> Self;
     /// The larger; the second if either is not a number.
@@ -226,6 +228,13 @@ impl Floats for ScalarFloats {
     }
 
     #[inline(always)]
+    fn mul_add(self, factor: Self, term: Self) -> Self {
+        Self(std::array::from_fn(|lane| {
+            self.0[lane].mul_add(factor.0[lane], term.0[lane])
+        }))
+    }
+
+    #[inline(always)]
     fn min(self, other: Self) -> Self {
         Self(std::array::from_fn(|lane| {
             if self.0[lane] < other.0[lane] {
@@ -386,6 +395,7 @@ mod avx2 {
     /// Whether this processor has what the module is compiled for.
     pub(super) fn is_available() -> bool {
         is_x86_feature_detected!("avx2")
+            && is_x86_feature_detected!("fma")
             && is_x86_feature_detected!("f16c")
             && is_x86_feature_detected!("bmi1")
             && is_x86_feature_detected!("bmi2")
@@ -395,7 +405,7 @@ mod avx2 {
 
     /// Runs a task on AVX2. Only [`Simd::dispatch`] calls this, with a [`Simd::Avx2`] that [`Simd::detect`] made.
     pub(super) fn run<T: Task>(task: T) -> T::Output {
-        #[target_feature(enable = "avx2,f16c,bmi1,bmi2,lzcnt,popcnt")]
+        #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,lzcnt,popcnt")]
         fn compiled<T: Task>(task: T) -> T::Output {
             task.run::<Avx2Floats>()
         }
@@ -477,6 +487,12 @@ mod avx2 {
         }
 
         #[inline(always)]
+        fn mul_add(self, factor: Self, term: Self) -> Self {
+            // SAFETY: as for the operators; `detect` has found FMA beside AVX2.
+            Self(unsafe { _mm256_fmadd_ps(self.0, factor.0, term.0) })
+        }
+
+        #[inline(always)]
         fn min(self, other: Self) -> Self {
             // SAFETY: as for the operators.
             Self(unsafe { _mm256_min_ps(self.0, other.0) })
@@ -527,7 +543,7 @@ mod avx2 {
             footprint: &Footprint<Self>,
             ink: &Ink<Self>,
         ) -> Covered<Self> {
-            #[target_feature(enable = "avx2,f16c,bmi1,bmi2,lzcnt,popcnt")]
+            #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,lzcnt,popcnt")]
             fn compiled<const WORDS: usize>(
                 raster: &mut Raster<Avx2Floats, WORDS>,
                 tables: &RasterTables,
@@ -548,7 +564,7 @@ mod avx2 {
             radius: f32,
             lanes: u8,
         ) -> u8 {
-            #[target_feature(enable = "avx2,f16c,bmi1,bmi2,lzcnt,popcnt")]
+            #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,lzcnt,popcnt")]
             fn compiled<const WORDS: usize>(
                 raster: &Raster<Avx2Floats, WORDS>,
                 tables: &RasterTables,

@@ -34,7 +34,17 @@ impl<F: Floats> Vector<F> {
 
     #[inline(always)]
     pub(crate) fn dot(self, other: Self) -> F {
-        self.x * other.x + self.y * other.y + self.z * other.z
+        self.x.mul_add(other.x, self.y.mul_add(other.y, self.z * other.z))
+    }
+
+    /// `self * scale + other`, rounded once.
+    #[inline(always)]
+    pub(crate) fn mul_add(self, scale: F, other: Self) -> Self {
+        Self {
+            x: self.x.mul_add(scale, other.x),
+            y: self.y.mul_add(scale, other.y),
+            z: self.z.mul_add(scale, other.z),
+        }
     }
 
     #[inline(always)]
