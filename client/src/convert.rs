@@ -4,7 +4,7 @@ use crate::job::{
     BuildJob, DaemonStatus, Job, JobEvent, JobOptions, JobState, MountStatus, Pool, ShadeJob, WorkerStatus,
 };
 use crate::live::LiveJob;
-use pbgi_core::{Bounds, BuildId, BuildSettings, NodeIndex, Quantizer, SceneInfo, ShadeSettings, Statistics};
+use pbgi_core::{Bounds, BuildId, BuildSettings, HitSides, NodeIndex, Quantizer, SceneInfo, ShadeSettings, Statistics};
 use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, Space};
 use pbgi_proto::v1;
 use std::path::Path;
@@ -121,6 +121,11 @@ fn wire_shade_settings(settings: &ShadeSettings) -> v1::ShadeSettings {
         bias: Some(settings.bias),
         bounces: Some(settings.bounces),
         interpolation: Some(settings.interpolation),
+        hit_sides: Some(match settings.hit_sides {
+            HitSides::Both => v1::HitSides::Both.into(),
+            HitSides::Front => v1::HitSides::Front.into(),
+            HitSides::Back => v1::HitSides::Back.into(),
+        }),
     }
 }
 

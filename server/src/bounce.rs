@@ -140,6 +140,7 @@ fn gather_settings(settings: &ShadeSettings) -> ShadeSettings {
         max_solid_angle: (4.0 * settings.max_solid_angle).min(0.5),
         raster_resolution: settings.raster_resolution.min(RASTER_RESOLUTION_DEFAULT / 2),
         bias: settings.bias,
+        hit_sides: settings.hit_sides,
         ..ShadeSettings::default()
     }
 }
@@ -151,7 +152,7 @@ fn target(dispatcher: &Dispatcher, original: BuildId, wanted: &Wanted, bounce: u
     let mut hasher = DefaultHasher::new();
     (original, bounce, env!("CARGO_PKG_VERSION")).hash(&mut hasher);
     let numbers = [gather.max_solid_angle, gather.raster_resolution as f32, gather.bias];
-    numbers.map(f32::to_bits).hash(&mut hasher);
+    (numbers.map(f32::to_bits), gather.hit_sides.name()).hash(&mut hasher);
     if let Some(environment) = &wanted.environment {
         let pixels = environment.pixels().iter().flatten();
         (environment.width(), environment.height()).hash(&mut hasher);

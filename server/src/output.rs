@@ -120,6 +120,7 @@ fn layered(picture: &Picture, planes: Planes) -> Result<LayeredImage, String> {
     set("bias", settings.bias.to_string());
     set("bounces", settings.bounces.to_string());
     set("interpolation", settings.interpolation.to_string());
+    set("hitsides", settings.hit_sides.name().to_owned());
     if let Some(environment) = &task.environment {
         set("environment", name(environment));
     }

@@ -1,7 +1,8 @@
 //! What a worker knows of a job, from the wire, checked.
 
 use pbgi_core::{
-    Bounds, BuildId, BuildSettings, Environment, MountId, NodeIndex, Quantizer, SceneInfo, ShadeSettings, limits,
+    Bounds, BuildId, BuildSettings, Environment, HitSides, MountId, NodeIndex, Quantizer, SceneInfo, ShadeSettings,
+    limits,
 };
 use pbgi_proto::v1;
 
@@ -105,6 +106,11 @@ fn shade_settings(wire: Option<&v1::ShadeSettings>) -> Result<ShadeSettings, Str
         falloff: wire.falloff.unwrap_or(default.falloff),
         bias: wire.bias.unwrap_or(default.bias),
         interpolation: wire.interpolation.unwrap_or(default.interpolation),
+        hit_sides: match wire.hit_sides() {
+            v1::HitSides::Both => HitSides::Both,
+            v1::HitSides::Front => HitSides::Front,
+            v1::HitSides::Back => HitSides::Back,
+        },
         ..default
     };
     settings.validate().map_err(|error| error.to_string())?;

@@ -146,7 +146,7 @@ class Client:
     ) -> jobs_pb2.Job:
         """Submits a picture.
 
-        `settings`: max_solid_angle, raster_resolution, max_dist, falloff, bias, bounces, interpolation. `options`: user, labels (a dict), priority,
+        `settings`: max_solid_angle, raster_resolution, max_dist, falloff, bias, bounces, interpolation, hit_sides. `options`: user, labels (a dict), priority,
         after (ids of jobs that must succeed first), paused, attach.
         """
         task = jobs_pb2.ShadeTask(

@@ -6,7 +6,7 @@ use clap::Args;
 use pbgi_client::JobOptions;
 use pbgi_client::private::PrivateOptions;
 use pbgi_client::size::parse_bytes;
-use pbgi_core::{BuildSettings, ShadeSettings, limits};
+use pbgi_core::{BuildSettings, HitSides, ShadeSettings, limits};
 use pbgi_points::{CloudOptions, Density, Facing, GBufferOptions, InvalidPoints, Radius, Space, ViewDensity};
 use std::path::{Path, PathBuf};
 
@@ -265,6 +265,9 @@ pub(crate) struct QualityArgs {
     /// faster by half and more where light is smooth [default: 0, shade all]
     #[arg(long, allow_negative_numbers = true, value_name = "E")]
     pub(crate) interpolation: Option<f32>,
+    /// Sides of surfaces that block and send light: both, front (where normals point to) or back [default: both]
+    #[arg(long, value_name = "SIDES", value_parser = hit_sides)]
+    pub(crate) hitsides: Option<HitSides>,
     /// Light probe around the scene: a latitude-longitude .hdr or .exr, y up [default: black]
     #[arg(long, value_name = "FILE")]
     pub(crate) environment: Option<PathBuf>,
@@ -281,10 +284,18 @@ impl QualityArgs {
             bias: self.bias.unwrap_or(default.bias),
             bounces: self.bounces.unwrap_or(default.bounces),
             interpolation: self.interpolation.unwrap_or(default.interpolation),
+            hit_sides: self.hitsides.unwrap_or(default.hit_sides),
         };
         settings.validate()?;
         Ok(settings)
     }
+}
+
+fn hit_sides(text: &str) -> Result<HitSides, String> {
+    [HitSides::Both, HitSides::Front, HitSides::Back]
+        .into_iter()
+        .find(|sides| sides.name() == text)
+        .ok_or_else(|| "write both, front or back".to_owned())
 }
 
 /// How a G-buffer is read.

@@ -31,7 +31,7 @@ pub use morton::{MortonCode, Quantizer};
 pub use node::{NodeKind, NodeRecord};
 pub use point::{InvalidPoint, PointRecord};
 pub use scene::SceneInfo;
-pub use settings::{BuildSettings, SettingsError, ShadeSettings};
+pub use settings::{BuildSettings, HitSides, SettingsError, ShadeSettings};
 pub use statistics::Statistics;
 pub use stream::PointStream;
 pub use voxel::Voxel;

@@ -88,6 +88,30 @@ impl BuildSettings {
     }
 }
 
+/// Which sides of surfaces block and send light (`hitsides`); the front is the one that normals point to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum HitSides {
+    /// Both.
+    #[default]
+    Both,
+    /// A surface is not there for who sees its back.
+    Front,
+    /// A surface is not there for who sees its front.
+    Back,
+}
+
+impl HitSides {
+    /// As options and files spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Both => "both",
+            Self::Front => "front",
+            Self::Back => "back",
+        }
+    }
+}
+
 /// How receivers are shaded. Names are RenderMan's.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ShadeSettings {
@@ -107,6 +131,8 @@ pub struct ShadeSettings {
     /// Error within which receivers may be given what their neighbours on the same surface tell: of occlusion, and of irradiance
     /// over that of the neighbours. 0 shades all.
     pub interpolation: f32,
+    /// Which sides of surfaces count. Light of a cluster without a plane cannot be told by sides: there, both send it.
+    pub hit_sides: HitSides,
 }
 
 impl Default for ShadeSettings {
@@ -119,6 +145,7 @@ impl Default for ShadeSettings {
             bias: 0.1,
             bounces: 1,
             interpolation: 0.0,
+            hit_sides: HitSides::default(),
         }
     }
 }

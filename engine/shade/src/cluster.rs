@@ -5,10 +5,10 @@ use crate::simd::{Floats, Words};
 use crate::vector::Vector;
 use glam::{Vec2, Vec3};
 use half::slice::HalfFloatSliceExt;
-use pbgi_core::NodeRecord;
 use pbgi_core::cluster::separate_sides;
 use pbgi_core::pack::area_normaliser;
 use pbgi_core::sh::{BASIS_FACTORS, SH_TERMS, basis};
+use pbgi_core::{HitSides, NodeRecord};
 
 /// Zonal factor of the clamped cosine times Y00: the first area term of a cluster over its area.
 const AREA_TERM: f32 = 0.886_226_9;
@@ -185,15 +185,31 @@ impl<'a> Cluster<'a> {
         [front * self.normaliser, back * self.normaliser]
     }
 
-    /// Projected area of both sides of all discs, and power, toward unit directions.
+    /// Area of a flat cluster's discs that face along its axis, and of those that face against it.
+    #[inline(never)]
+    pub(crate) fn facing(&self) -> [f32; 2] {
+        let (mut even, mut odd) = (0.0, 0.0);
+        for (term, y) in basis(self.axis).iter().enumerate() {
+            let sum = if (1..4).contains(&term) { &mut odd } else { &mut even };
+            *sum += self.node.sh[term][0].to_f32() * y;
+        }
+        let (front, back) = separate_sides(Vec3::splat(even + odd), Vec3::splat(even - odd));
+        [front.x * self.normaliser, back.x * self.normaliser]
+    }
+
+    /// Projected area of the sides of all discs that count, and power, toward unit directions.
     #[inline(always)]
-    pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>) -> (F, Vector<F>) {
+    pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>, sides: HitSides) -> (F, Vector<F>) {
         let terms = self.terms();
         let y = basis_of(direction);
         let (zero, scale) = (F::splat(0.0), F::splat(self.normaliser));
-        // Both sides: twice the even bands.
-        let [even, _] = bands(&terms, &y, 0);
-        let area = (even + even).max(zero) * scale;
+        let [even, odd] = bands(&terms, &y, 0);
+        let shown = match sides {
+            HitSides::Both => even + even,
+            HitSides::Front => even + odd,
+            HitSides::Back => even - odd,
+        };
+        let area = shown.max(zero) * scale;
         let [red, green, blue] = [bands(&terms, &y, 1), bands(&terms, &y, 2), bands(&terms, &y, 3)];
         let power = Vector {
             x: (red[0] + red[1]).max(zero) * scale,

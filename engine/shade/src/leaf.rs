@@ -61,6 +61,8 @@ pub(crate) struct Facet {
     pub(crate) radius: f32,
     /// Radiance of the side the normal points to, and of the other.
     pub(crate) radiance: [Vec3; 2],
+    /// Area of the points that face as the normal does, and of those that face the other way.
+    pub(crate) facing: [f32; 2],
     /// The part of the voxel that its points reach.
     pub(crate) low: Vec3,
     pub(crate) high: Vec3,
@@ -115,6 +117,7 @@ struct Plane {
     low: Vec3,
     high: Vec3,
     power: [Vec3; 2],
+    facing: [f32; 2],
     members: u64,
 }
 
@@ -146,6 +149,7 @@ pub(crate) fn take_apart(points: &[PointRecord], voxel: Cube, parts: &mut Vec<Pa
             centroid: voxel.center + plane.centroid,
             radius: plane.radius,
             radiance: plane.power.map(|power| power / plane.area),
+            facing: plane.facing,
             low: voxel.center + (plane.low - reach).max(-bound),
             high: voxel.center + (plane.high + reach).min(bound),
             cuts: cuts.map(|cut| Cut {
@@ -184,6 +188,7 @@ fn planes(points: &[PointRecord], origin: Vec3) -> Option<([Plane; FACETS_MAX], 
         low: Vec3::INFINITY,
         high: Vec3::NEG_INFINITY,
         power: [Vec3::ZERO; 2],
+        facing: [0.0; 2],
         members: 0,
     };
     let (mut planes, mut len) = ([empty; FACETS_MAX], 0);
@@ -223,6 +228,7 @@ impl Plane {
         } else {
             (normal, front, back)
         };
+        self.facing[usize::from(flipped)] += area;
         self.normal += normal * area;
         self.centroid += position * area;
         self.area += area;

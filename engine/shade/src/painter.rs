@@ -8,6 +8,7 @@ use crate::raster::{Covered, Ink, Raster};
 use crate::simd::{Floats, LANES, Words};
 use crate::vector::Vector;
 use glam::Vec3;
+use pbgi_core::HitSides;
 
 /// Above this the voxel holds two sheets, of which the receiver sees one.
 const TWO_SHEETS_FILL: f32 = 1.6;
@@ -93,6 +94,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
             return;
         }
         let lanes = lanes & !cluster.own_surface(self.pack.frames.z, centroid, center);
+        let lanes = self.hit(lanes, Vector::splat(cluster.axis), centroid, || cluster.facing());
         if lanes != 0 {
             self.draw_flat(cluster, visit, center, centroid, lanes);
         }
@@ -147,8 +149,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let distance = centroid.length_squared().sqrt();
         let apart = F::splat(1e-6 * visit.half).less(distance);
         let direction = centroid * (F::splat(1.0) / distance);
-        // Both sides of every disc.
-        let (shown, power) = cluster.toward(-direction);
+        let (shown, power) = cluster.toward(-direction, self.walk.settings.hit_sides);
         let plane = Plane {
             normal: frames.local_from_world(direction),
             distance,
@@ -215,7 +216,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let touched =
             is_aligned(frames.z, normal) & plane.distance.less(F::splat(self.walk.settings.bias * facet.radius));
         let own = touched | is_own_surface(frames.z, normal, centroid, DISC_WIDTH * facet.radius);
-        let lanes = lanes & !own.lanes();
+        let lanes = self.hit(lanes & !own.lanes(), normal, centroid, || facet.facing);
         if lanes == 0 {
             return;
         }
@@ -246,7 +247,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let (center, normal) = (self.pack.relative(disc.center), Vector::splat(disc.normal));
         let plane = Plane::through(frames, center, normal, TOUCH * disc.radius);
         let own = self.is_own_disc(disc, center, normal, plane.distance);
-        let lanes = lanes & !own.lanes();
+        let lanes = self.hit(lanes & !own.lanes(), normal, center, || [1.0, 0.0]);
         if lanes == 0 {
             return;
         }
@@ -281,6 +282,34 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let behind =
             facing & F::splat(0.0).less(normal.dot(center)) & distance.less(F::splat(BEHIND_DEPTH * disc.radius));
         near & (own | under | behind)
+    }
+
+    /// The lanes that see sides which count of a flat element at `center`. `facing` gives the area that faces along its normal,
+    /// and against it.
+    #[inline(always)]
+    fn hit(&self, lanes: u8, normal: Vector<F>, center: Vector<F>, facing: impl Fn() -> [f32; 2]) -> u8 {
+        /// Share of an element's area that is enough: of a sheet with two sides, half is.
+        const SHARE_MIN: f32 = 0.25;
+        let sides = self.walk.settings.hit_sides;
+        if sides == HitSides::Both {
+            return lanes;
+        }
+        let [along, against] = facing();
+        // Who stands where the normal points to sees the fronts of what faces along it, and the backs of the rest.
+        let (before, behind) = match sides {
+            HitSides::Back => (against, along),
+            _ => (along, against),
+        };
+        let enough = SHARE_MIN * (along + against);
+        let stands_before = normal.dot(center).less(F::splat(0.0)).lanes();
+        let mut hit = 0;
+        if before > enough {
+            hit |= stands_before;
+        }
+        if behind > enough {
+            hit |= !stands_before;
+        }
+        lanes & hit
     }
 
     /// Adds what a two-sided element at `center` shows: the first of `sides` where the receiver is on the side of `normal`.

@@ -5,7 +5,7 @@
 mod support;
 
 use glam::Vec3;
-use pbgi_core::{Environment, PointRecord, ShadeSettings};
+use pbgi_core::{Environment, HitSides, PointRecord, ShadeSettings};
 use pbgi_shade::{Receiver, Shaded, Shader};
 use std::f32::consts::PI;
 
@@ -232,4 +232,48 @@ fn a_hole_is_zero() {
         normal: Vec3::Y,
     };
     assert_eq!(shade(&room(20, 1.0), &[hole, lost]), [Shaded::default(); 2]);
+}
+
+#[test]
+fn surfaces_are_there_for_who_sees_a_side_that_counts() {
+    let with = |points: &[PointRecord], hit_sides, at: Receiver| {
+        let settings = ShadeSettings {
+            hit_sides,
+            ..ShadeSettings::default()
+        };
+        shade_with(points, settings, None, &[at])[0]
+    };
+    let (x, z) = (Vec3::X * 2.0, Vec3::Z * 2.0);
+    let corner = Vec3::new(-1.0, 1.0, -1.0);
+    let (mut down, mut up_turned, mut ball) = (vec![], vec![], vec![]);
+    support::quad(corner, x, z, 40, 1.0, &mut down);
+    support::quad(corner, z, x, 40, 1.0, &mut up_turned);
+    assert!(down[0].normal().y < -0.9 && up_turned[0].normal().y > 0.9);
+    support::sphere(Vec3::new(0.0, 3.0, 0.0), 1.0, 20_000, 1.0, &mut ball);
+    let at = up(0.1, 0.0, 0.2);
+    for points in [&down, &ball] {
+        let both = with(points, HitSides::Both, at);
+        assert!(both.occlusion > 0.1 && both.irradiance[0] > 0.3, "{both:?}");
+        let front = with(points, HitSides::Front, at);
+        assert!((front.occlusion - both.occlusion).abs() < 0.02, "{front:?} {both:?}");
+        assert!(
+            (front.irradiance[0] / both.irradiance[0] - 1.0).abs() < 0.1,
+            "{front:?} {both:?}"
+        );
+    }
+    assert_eq!(with(&down, HitSides::Back, at).occlusion, 0.0);
+    assert_eq!(with(&up_turned, HitSides::Front, at).occlusion, 0.0);
+    let from_below = with(&up_turned, HitSides::Back, at);
+    assert!(
+        from_below.occlusion > 0.1 && from_below.irradiance == [0.0; 3],
+        "{from_below:?}"
+    );
+    // The far half of a ball shows its inside, which is as large and sends nothing.
+    let inside = with(&ball, HitSides::Back, at);
+    let whole = with(&ball, HitSides::Both, at);
+    assert!(
+        (inside.occlusion / whole.occlusion - 1.0).abs() < 0.3,
+        "{inside:?} {whole:?}"
+    );
+    assert!(inside.irradiance[0] < 0.3 * whole.irradiance[0], "{inside:?} {whole:?}");
 }

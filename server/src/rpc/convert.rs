@@ -4,7 +4,7 @@ use crate::dispatcher::{DaemonStatus, TaskInfo};
 use crate::error::JobError;
 use crate::job::{BuildTask, JobEvent, JobOptions, JobState, JobStatus, Request, ShadeTask};
 use crate::shade_job::Counters;
-use pbgi_core::{Bounds, BuildSettings, SceneInfo, ShadeSettings, Statistics};
+use pbgi_core::{Bounds, BuildSettings, HitSides, SceneInfo, ShadeSettings, Statistics};
 use pbgi_points::{CloudOptions, Density, Facing, GBufferOptions, InvalidPoints, Radius, Space, ViewDensity};
 use pbgi_proto::v1;
 use pbgi_store::{LevelShape, SceneShape};
@@ -129,6 +129,11 @@ pub(super) fn shade_settings(settings: Option<v1::ShadeSettings>) -> ShadeSettin
         bias: given.bias.unwrap_or(default.bias),
         bounces: given.bounces.unwrap_or(default.bounces),
         interpolation: given.interpolation.unwrap_or(default.interpolation),
+        hit_sides: match given.hit_sides() {
+            v1::HitSides::Both => HitSides::Both,
+            v1::HitSides::Front => HitSides::Front,
+            v1::HitSides::Back => HitSides::Back,
+        },
     }
 }
 
@@ -231,11 +236,20 @@ pub(super) fn task(task: &TaskInfo) -> v1::Task {
             // Done before: the scene's points carry the others.
             bounces: None,
             interpolation: Some(settings.interpolation),
+            hit_sides: Some(wire_hit_sides(settings.hit_sides).into()),
         }),
         environment_width: task.environment.as_ref().map_or(0, |environment| environment.width()),
         environment_height: task.environment.as_ref().map_or(0, |environment| environment.height()),
         environment: pixels.flat_map(|value| value.to_le_bytes()).collect(),
         rays: task.pixel_angle.map(|pixel_angle| v1::RayTracing { pixel_angle }),
+    }
+}
+
+fn wire_hit_sides(sides: HitSides) -> v1::HitSides {
+    match sides {
+        HitSides::Both => v1::HitSides::Both,
+        HitSides::Front => v1::HitSides::Front,
+        HitSides::Back => v1::HitSides::Back,
     }
 }
 

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x13pbgi/v1/types.proto\x12\x07pbgi.v1\"\xc1\x01\n\rBuildSettings\x12\x15\n\x08leaf_max\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x19\n\x0c\x63hunk_levels\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x1b\n\x0enodes_per_page\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x1c\n\x0fpoints_per_page\x18\x04 \x01(\rH\x03\x88\x01\x01\x42\x0b\n\t_leaf_maxB\x0f\n\r_chunk_levelsB\x11\n\x0f_nodes_per_pageB\x12\n\x10_points_per_page\"\xa9\x02\n\rShadeSettings\x12\x1c\n\x0fmax_solid_angle\x18\x01 \x01(\x02H\x00\x88\x01\x01\x12\x1e\n\x11raster_resolution\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x15\n\x08max_dist\x18\x03 \x01(\x02H\x02\x88\x01\x01\x12\x14\n\x07\x66\x61lloff\x18\x04 \x01(\x02H\x03\x88\x01\x01\x12\x11\n\x04\x62ias\x18\x05 \x01(\x02H\x04\x88\x01\x01\x12\x14\n\x07\x62ounces\x18\x06 \x01(\rH\x05\x88\x01\x01\x12\x1a\n\rinterpolation\x18\x07 \x01(\x02H\x06\x88\x01\x01\x42\x12\n\x10_max_solid_angleB\x14\n\x12_raster_resolutionB\x0b\n\t_max_distB\n\n\x08_falloffB\x07\n\x05_biasB\n\n\x08_bouncesB\x10\n\x0e_interpolation\"!\n\nRayTracing\x12\x13\n\x0bpixel_angle\x18\x01 \x01(\x02\"\"\n\x06\x42ounds\x12\x0b\n\x03min\x18\x01 \x03(\x02\x12\x0b\n\x03max\x18\x02 \x03(\x02\"\x86\x02\n\tSceneInfo\x12\x10\n\x08\x62uild_id\x18\x01 \x01(\t\x12\x13\n\x0bpoint_count\x18\x02 \x01(\x04\x12\x12\n\nnode_count\x18\x03 \x01(\x04\x12\x12\n\nnode_slots\x18\x04 \x01(\x04\x12\x11\n\x04root\x18\x05 \x01(\rH\x00\x88\x01\x01\x12$\n\x06\x62ounds\x18\x06 \x01(\x0b\x32\x0f.pbgi.v1.BoundsH\x01\x88\x01\x01\x12\x0f\n\x07lattice\x18\x07 \x03(\x01\x12\x12\n\nradius_max\x18\x08 \x01(\x02\x12(\n\x08settings\x18\t \x01(\x0b\x32\x16.pbgi.v1.BuildSettings\x12\x0e\n\x06origin\x18\n \x03(\x01\x42\x07\n\x05_rootB\t\n\x07_bounds\"f\n\nStatistics\x12+\n\x04rows\x18\x01 \x03(\x0b\x32\x1d.pbgi.v1.Statistics.RowsEntry\x1a+\n\tRowsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x13pbgi/v1/types.proto\x12\x07pbgi.v1\"\xc1\x01\n\rBuildSettings\x12\x15\n\x08leaf_max\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x19\n\x0c\x63hunk_levels\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x1b\n\x0enodes_per_page\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x1c\n\x0fpoints_per_page\x18\x04 \x01(\rH\x03\x88\x01\x01\x42\x0b\n\t_leaf_maxB\x0f\n\r_chunk_levelsB\x11\n\x0f_nodes_per_pageB\x12\n\x10_points_per_page\"\xe2\x02\n\rShadeSettings\x12\x1c\n\x0fmax_solid_angle\x18\x01 \x01(\x02H\x00\x88\x01\x01\x12\x1e\n\x11raster_resolution\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x15\n\x08max_dist\x18\x03 \x01(\x02H\x02\x88\x01\x01\x12\x14\n\x07\x66\x61lloff\x18\x04 \x01(\x02H\x03\x88\x01\x01\x12\x11\n\x04\x62ias\x18\x05 \x01(\x02H\x04\x88\x01\x01\x12\x14\n\x07\x62ounces\x18\x06 \x01(\rH\x05\x88\x01\x01\x12\x1a\n\rinterpolation\x18\x07 \x01(\x02H\x06\x88\x01\x01\x12)\n\thit_sides\x18\x08 \x01(\x0e\x32\x11.pbgi.v1.HitSidesH\x07\x88\x01\x01\x42\x12\n\x10_max_solid_angleB\x14\n\x12_raster_resolutionB\x0b\n\t_max_distB\n\n\x08_falloffB\x07\n\x05_biasB\n\n\x08_bouncesB\x10\n\x0e_interpolationB\x0c\n\n_hit_sides\"!\n\nRayTracing\x12\x13\n\x0bpixel_angle\x18\x01 \x01(\x02\"\"\n\x06\x42ounds\x12\x0b\n\x03min\x18\x01 \x03(\x02\x12\x0b\n\x03max\x18\x02 \x03(\x02\"\x86\x02\n\tSceneInfo\x12\x10\n\x08\x62uild_id\x18\x01 \x01(\t\x12\x13\n\x0bpoint_count\x18\x02 \x01(\x04\x12\x12\n\nnode_count\x18\x03 \x01(\x04\x12\x12\n\nnode_slots\x18\x04 \x01(\x04\x12\x11\n\x04root\x18\x05 \x01(\rH\x00\x88\x01\x01\x12$\n\x06\x62ounds\x18\x06 \x01(\x0b\x32\x0f.pbgi.v1.BoundsH\x01\x88\x01\x01\x12\x0f\n\x07lattice\x18\x07 \x03(\x01\x12\x12\n\nradius_max\x18\x08 \x01(\x02\x12(\n\x08settings\x18\t \x01(\x0b\x32\x16.pbgi.v1.BuildSettings\x12\x0e\n\x06origin\x18\n \x03(\x01\x42\x07\n\x05_rootB\t\n\x07_bounds\"f\n\nStatistics\x12+\n\x04rows\x18\x01 \x03(\x0b\x32\x1d.pbgi.v1.Statistics.RowsEntry\x1a+\n\tRowsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01*G\n\x08HitSides\x12\x12\n\x0eHIT_SIDES_BOTH\x10\x00\x12\x13\n\x0fHIT_SIDES_FRONT\x10\x01\x12\x12\n\x0eHIT_SIDES_BACK\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,18 +33,20 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_STATISTICS_ROWSENTRY']._loaded_options = None
   _globals['_STATISTICS_ROWSENTRY']._serialized_options = b'8\001'
+  _globals['_HITSIDES']._serialized_start=1025
+  _globals['_HITSIDES']._serialized_end=1096
   _globals['_BUILDSETTINGS']._serialized_start=33
   _globals['_BUILDSETTINGS']._serialized_end=226
   _globals['_SHADESETTINGS']._serialized_start=229
-  _globals['_SHADESETTINGS']._serialized_end=526
-  _globals['_RAYTRACING']._serialized_start=528
-  _globals['_RAYTRACING']._serialized_end=561
-  _globals['_BOUNDS']._serialized_start=563
-  _globals['_BOUNDS']._serialized_end=597
-  _globals['_SCENEINFO']._serialized_start=600
-  _globals['_SCENEINFO']._serialized_end=862
-  _globals['_STATISTICS']._serialized_start=864
-  _globals['_STATISTICS']._serialized_end=966
-  _globals['_STATISTICS_ROWSENTRY']._serialized_start=923
-  _globals['_STATISTICS_ROWSENTRY']._serialized_end=966
+  _globals['_SHADESETTINGS']._serialized_end=583
+  _globals['_RAYTRACING']._serialized_start=585
+  _globals['_RAYTRACING']._serialized_end=618
+  _globals['_BOUNDS']._serialized_start=620
+  _globals['_BOUNDS']._serialized_end=654
+  _globals['_SCENEINFO']._serialized_start=657
+  _globals['_SCENEINFO']._serialized_end=919
+  _globals['_STATISTICS']._serialized_start=921
+  _globals['_STATISTICS']._serialized_end=1023
+  _globals['_STATISTICS_ROWSENTRY']._serialized_start=980
+  _globals['_STATISTICS_ROWSENTRY']._serialized_end=1023
 # @@protoc_insertion_point(module_scope)
