@@ -129,7 +129,9 @@ impl TriangleBvh {
 }
 
 fn bvh_ray(ray: &Ray, limit: f32) -> obvhs::ray::Ray {
-    obvhs::ray::Ray::new(ray.origin.into(), ray.direction.into(), 0.0, limit)
+    // A component of -0 has the library take a box's sides the wrong way round, and miss it.
+    let direction = ray.direction + Vec3::ZERO;
+    obvhs::ray::Ray::new(ray.origin.into(), direction.into(), 0.0, limit)
 }
 
 impl Triangle {

@@ -299,3 +299,29 @@ fn the_example_of_the_documentation_is_sound() {
     assert!(lit > 300, "{lit} pixels in the sun");
     assert!(emission.iter().any(|light| light[0] > 1.0), "the panel is seen");
 }
+
+#[test]
+fn a_light_that_travels_along_an_axis_is_shadowed() {
+    for axis in 0..3 {
+        for sign in [-1.0, 1.0] {
+            let mut direction = [0.0f32; 3];
+            direction[axis] = sign;
+            // Two squares across the light, one behind the other.
+            let turn = [[0, 0, 90], [0, 0, 0], [90, 0, 0]][axis];
+            let behind = direction;
+            let text = format!(
+                "[[mesh]]\nfile = \"square.ply\"\ninstances = [{{ rotate = {turn:?} }}, {{ rotate = {turn:?}, translate = {behind:?} }}]\n\
+                 [[light.directional]]\ndirection = {direction:?}\nirradiance = 3\n"
+            );
+            for point in sample(load(&text), Density::Points(200)) {
+                let lit = point.sides().front[0] + point.sides().back[0] > 0.0;
+                assert_eq!(
+                    lit,
+                    point.position[axis].abs() < 0.5,
+                    "{direction:?} {:?}",
+                    point.position
+                );
+            }
+        }
+    }
+}
