@@ -2,7 +2,7 @@
 
 use super::args::{CameraArgs, Size};
 use super::failure::Failure;
-use pbgi_points::{Camera, GBuffer, MeshScene};
+use pbgi_points::{Camera, GBuffer, MeshScene, Surroundings};
 use std::path::{Path, PathBuf};
 
 /// Rows of a picture whose size nobody asked for.
@@ -15,8 +15,8 @@ const ASPECT_RANGE: std::ops::RangeInclusive<f32> = 0.1..=10.0;
 /// What is known of a picture before it is shaded.
 pub(crate) struct Frame {
     pub(crate) gbuffer: GBuffer,
-    /// The light probe that the scene file names.
-    pub(crate) environment: Option<PathBuf>,
+    /// What surrounds the scene, where it says so.
+    pub(crate) environment: Option<Surroundings>,
 }
 
 /// Renders the G-buffer of a mesh or scene file; blocks.
@@ -27,8 +27,18 @@ pub(crate) fn render(scene: &Path, args: CameraArgs) -> Result<Frame, Failure> {
     let size = args.size.unwrap_or_else(|| size_for(&camera));
     Ok(Frame {
         gbuffer: GBuffer::render(&mesh, &camera, size.width, size.height)?,
-        environment: mesh.environment().map(Path::to_owned),
+        environment: mesh.environment().cloned(),
     })
+}
+
+/// What surrounds a scene as a light probe: its picture, or one in `folder` where that is turned or multiplied; blocks.
+pub(crate) fn light_probe(surroundings: &Surroundings, folder: &Path) -> Result<PathBuf, Failure> {
+    if let Some(file) = surroundings.file() {
+        return Ok(file.to_owned());
+    }
+    let baked = folder.join("environment.exr");
+    surroundings.bake()?.write_exr(&baked)?;
+    Ok(baked)
 }
 
 fn size_for(camera: &Camera) -> Size {

@@ -30,7 +30,7 @@ Examples:
 #[derive(Args, Debug)]
 #[command(after_help = BUILD_EXAMPLES)]
 pub(crate) struct BuildArgs {
-    /// Meshes (.glb, .gltf, .obj, .ply with faces) and scene files (.toml), sampled and lit by their lights; point clouds (.ply, .las, .laz, .ptc), of which those of
+    /// Meshes (.glb, .gltf, .obj, .usd, .ply with faces) and scene files (.toml), sampled and lit by their lights; point clouds (.ply, .las, .laz, .ptc), of which those of
     /// the LAS family are turned so that y is up; scenes (.pbgi) whose points are built again
     #[arg(required = true, value_name = "INPUT")]
     inputs: Vec<PathBuf>,

@@ -23,7 +23,7 @@ Points carry the radiance that leaves them: direct light reflected once, and emi
 #[derive(Args, Debug)]
 #[command(after_help = SAMPLE_EXAMPLES)]
 pub(crate) struct SampleArgs {
-    /// Meshes that light each other (.glb, .gltf, .obj, .ply with faces) and scene files (.toml), and clouds (.ply, .las, .laz, .ptc, .pbgi), which are converted
+    /// Meshes that light each other (.glb, .gltf, .obj, .usd, .ply with faces) and scene files (.toml), and clouds (.ply, .las, .laz, .ptc, .pbgi), which are converted
     #[arg(required = true, value_name = "SCENE")]
     inputs: Vec<PathBuf>,
     #[command(flatten)]
@@ -92,7 +92,7 @@ Writes P and N in world space, albedo, direct (irradiance of the punctual lights
 #[derive(Args, Debug)]
 #[command(after_help = GBUFFER_EXAMPLES)]
 pub(crate) struct GbufferArgs {
-    /// A mesh (.glb, .gltf, .obj, .ply with faces) or a scene file (.toml)
+    /// A mesh (.glb, .gltf, .obj, .usd, .ply with faces) or a scene file (.toml)
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     #[command(flatten)]

@@ -29,7 +29,7 @@ The built scene stays in XDG_CACHE_HOME/pbgi/scenes, keyed by the mesh and its s
 #[derive(Args, Debug)]
 #[command(after_help = RENDER_EXAMPLES)]
 pub(crate) struct RenderArgs {
-    /// A mesh with lights (.glb, .gltf, .obj, .ply with faces) or a scene file (.toml)
+    /// A mesh with lights (.glb, .gltf, .obj, .usd, .ply with faces) or a scene file (.toml)
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     #[command(flatten)]
@@ -140,6 +140,14 @@ async fn picture(plan: &Plan, server: &ServerArgs, stats: &StatsArgs, interrupt:
         let Frame { gbuffer, environment } = interrupt.blocking(move || frame::render(&input, camera)).await?;
         let passes = folder.path().join("gbuffer.exr");
         gbuffer.write(&passes)?;
+        let environment = match (&plan.environment, environment) {
+            (None, Some(surroundings)) => {
+                let folder = folder.path().to_owned();
+                let probe = interrupt.blocking(move || frame::light_probe(&surroundings, &folder));
+                Some(probe.await?)
+            }
+            (given, _) => given.clone(),
+        };
         let client = session::connect(server, interrupt, &progress).await?;
         let (scene, mut statistics) = scene(plan, &client, interrupt, &mut progress).await?;
         let shaded = folder.path().join("shaded.exr");
@@ -154,7 +162,7 @@ async fn picture(plan: &Plan, server: &ServerArgs, stats: &StatsArgs, interrupt:
             output: shaded.clone(),
             overwrite: false,
             settings: plan.settings,
-            environment: plan.environment.clone().or(environment),
+            environment,
             workers: server.job_workers(),
         };
         let shading = session::run(&client, &Work::Shade(job), interrupt, &mut progress).await?;

@@ -98,6 +98,10 @@ pub(crate) fn digest(input: &Path, density: Density) -> Result<String, Failure> 
         paths.extend(pbgi_points::scene_meshes(input)?);
     }
     for index in 0..paths.len() {
+        if matches!(extension(&paths[index]).as_str(), "usd" | "usda" | "usdc" | "usdz") {
+            paths.extend(pbgi_points::usd_files(&paths[index])?);
+            continue;
+        }
         let folder = paths[index].parent().unwrap_or(Path::new("/")).to_owned();
         let named = named_files(&paths[index]).into_iter();
         paths.extend(named.map(|name| folder.join(name)));

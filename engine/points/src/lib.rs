@@ -1,6 +1,6 @@
 //! Where points come from, and what pictures are made of.
 //!
-//! [`open_input`] turns files into one stream of lit points: meshes ([`MeshScene`]: glTF, OBJ, PLY, scene files) are sampled evenly and lit by
+//! [`open_input`] turns files into one stream of lit points: meshes ([`MeshScene`]: glTF, OBJ, PLY, USD, scene files) are sampled evenly and lit by
 //! their lights with shadow rays, clouds ([`cloud`]: PLY, LAS, LAZ, COPC, PTC, built scenes) are read as they are, with
 //! normals and radii estimated where they have none. [`GBuffer`] says what a camera sees, rendered from a
 //! mesh or read from another renderer's EXR passes. [`bake`] gives the points of a cloud what was shaded
@@ -37,8 +37,14 @@ mod open;
 mod output;
 mod sample;
 mod scene_file;
+mod surroundings;
 mod texture_file;
 mod trace;
+#[cfg(feature = "usd")]
+mod usd_file;
+#[cfg(not(feature = "usd"))]
+#[path = "usd_file/refused.rs"]
+mod usd_file;
 
 pub use crate::image::{
     Attributes, Channel, Difference, LayerDifference, LayeredImage, Precision, ToneMap, Window, read_environment,
@@ -58,3 +64,5 @@ pub use raycast::RayCast;
 pub use sample::MeshPoints;
 pub use scene::MeshScene;
 pub use scene_file::scene_meshes;
+pub use surroundings::Surroundings;
+pub use usd_file::usd_files;

@@ -65,6 +65,9 @@ pub const TRIANGLE_BYTES: usize = 300;
 /// Memory of a placed mesh at its peak, while the file is read (480 measured on 110,000); about 70 of them are kept.
 pub const INSTANCE_BYTES: usize = 500;
 
+/// Placed triangles of a mesh up to which it is copied rather than placed.
+pub const COPIED_TRIANGLES_MAX: usize = 100_000;
+
 /// Most patches of a procedural scene that are written as triangles: a gigabyte.
 pub const GLB_PATCHES_MAX: u64 = 1 << 23;
 
@@ -85,3 +88,13 @@ pub const EXR_BYTES_MAX: u64 = 4 << 30;
 
 /// Most bytes of one tile or block of scanlines of an EXR file, decoded.
 pub const EXR_BLOCK_BYTES_MAX: u64 = 1 << 30;
+
+/// Most prims of a USD stage that are looked at, those of shared prototypes once: references that double on each level would have
+/// no end.
+pub const USD_PRIMS_MAX: usize = 1 << 20;
+
+/// Deepest nesting of brackets in a USD text file, and of prims of a stage: each level takes stack.
+pub const USD_DEPTH_MAX: usize = 256;
+
+/// Longest time that one prim or one file of a USD stage may take, seconds: composition can be made endless.
+pub const USD_STALL_SECS: u64 = 300;

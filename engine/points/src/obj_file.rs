@@ -4,7 +4,7 @@
 use crate::error::PointsError;
 use crate::material::{Material, Texture, TextureSlot, Wrap};
 use crate::named_file::beside;
-use crate::scene::{Geometry, Instance, SceneParts};
+use crate::scene::{Geometry, SceneParts};
 use crate::texture_file::decode;
 use glam::{Affine2, DAffine3, Vec2};
 use std::cell::Cell;
@@ -81,8 +81,7 @@ pub(crate) fn read(path: &Path) -> Result<SceneParts, PointsError> {
         };
         world.append(path, &piece, &DAffine3::IDENTITY)?;
     }
-    parts.geometries.push(world);
-    parts.instances.push(Instance::new(0, &DAffine3::IDENTITY));
+    parts.place_once(world);
     Ok(parts)
 }
 

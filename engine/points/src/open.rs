@@ -114,7 +114,7 @@ pub(crate) enum Kind {
     Scene,
 }
 
-/// Opens files as one stream of points. Mesh files (`.gltf`, `.glb`, `.obj`, `.ply` with faces, scene files `.toml`) are put into one scene, so that each is lit
+/// Opens files as one stream of points. Mesh files (`.gltf`, `.glb`, `.obj`, `.usd*`, `.ply` with faces, scene files `.toml`) are put into one scene, so that each is lit
 /// by the lights and shadowed by the surfaces of all; they come first, then the clouds (`.ply`, `.las`, `.laz`, `.ptc`, and
 /// the points of built scenes, `.pbgi`) in the order given, those last whose normals or radii are estimated: they come in
 /// Z-order, all files that lack the same together.
@@ -227,7 +227,7 @@ fn kind(path: &Path) -> Result<Kind, PointsError> {
 /// What a file is by its name alone, whether it is there or not: the vertices of a PLY file are a cloud.
 pub(crate) fn kind_by_name(path: &Path) -> Result<Kind, PointsError> {
     Ok(match extension(path).as_str() {
-        "gltf" | "glb" | "obj" | "toml" => Kind::Mesh,
+        "gltf" | "glb" | "obj" | "toml" | "usd" | "usda" | "usdc" | "usdz" => Kind::Mesh,
         "ply" => Kind::Ply,
         "las" | "laz" => Kind::Las,
         "ptc" => Kind::Ptc,
@@ -237,7 +237,7 @@ pub(crate) fn kind_by_name(path: &Path) -> Result<Kind, PointsError> {
             return Err(PointsError::unsupported(
                 path,
                 what,
-                "convert it to .glb, .gltf, .obj, .ply, .las, .laz or .ptc, or describe it in a scene file, .toml",
+                "convert it to .glb, .gltf, .usd, .obj, .ply, .las, .laz or .ptc, or describe it in a scene file, .toml",
             ));
         }
     })

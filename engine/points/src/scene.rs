@@ -5,11 +5,12 @@ use crate::charts::Charts;
 use crate::error::PointsError;
 use crate::light::Light;
 use crate::material::{Material, Texture};
+use crate::surroundings::Surroundings;
 use crate::trace::Tracer;
-use crate::{gltf_file, limits, obj_file, ply, scene_file};
+use crate::{gltf_file, limits, obj_file, ply, scene_file, usd_file};
 use glam::{DAffine3, DVec3, Vec2, Vec3};
 use pbgi_core::Bounds;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Triangles with materials and textures, lights and cameras, ready to be sampled and traced. A mesh that is placed many
 /// times is kept once.
@@ -20,7 +21,7 @@ pub struct MeshScene {
     pub(crate) textures: Vec<Texture>,
     lights: Vec<Light>,
     cameras: Vec<Camera>,
-    environment: Option<PathBuf>,
+    environment: Option<Surroundings>,
     bounds: Bounds,
     area: f64,
     tracer: Tracer,
@@ -78,13 +79,12 @@ pub(crate) struct SceneParts {
     pub(crate) textures: Vec<Texture>,
     pub(crate) lights: Vec<Light>,
     pub(crate) cameras: Vec<Camera>,
-    /// The light probe that a scene file names.
-    pub(crate) environment: Option<PathBuf>,
+    pub(crate) environment: Option<Surroundings>,
 }
 
 impl MeshScene {
-    /// Reads a mesh file, `.gltf`, `.glb`, `.obj` or `.ply`, with the buffers and textures it names, or a scene file, `.toml`,
-    /// with all the mesh files it names.
+    /// Reads a mesh file, `.gltf`, `.glb`, `.obj`, `.ply` or (with the feature `usd`) `.usd*`, with the buffers and textures it
+    /// names, or a scene file, `.toml`, with all the mesh files it names.
     ///
     /// # Errors
     /// No or a damaged file, a missing buffer or texture, an unsupported feature, no triangles, a vertex that is not finite.
@@ -106,28 +106,20 @@ impl MeshScene {
     /// As [`Self::load`]; [`PointsError::Memory`] with what is needed.
     pub fn load_within(paths: &[&Path], memory_bytes: u64) -> Result<Self, PointsError> {
         let mut all = SceneParts::default();
-        let fits = |needed: u64| match needed <= memory_bytes {
-            true => Ok(()),
-            false => Err(PointsError::Memory {
-                what: "the geometry",
-                needed,
-                available: memory_bytes,
-            }),
-        };
+        let room = Room::new(memory_bytes);
         for path in paths {
-            let before = all.memory_bytes();
+            let left = room.less(all.memory_bytes());
             let parts = match crate::open::extension(path).as_str() {
                 "toml" => {
-                    let beside =
-                        |mesh: &Path, parts: &SceneParts| read_mesh(mesh, before + parts.memory_bytes(), &fits);
+                    let beside = |mesh: &Path, parts: &SceneParts| read_mesh(mesh, left.less(parts.memory_bytes()));
                     let parts = scene_file::read(path, &beside)?;
                     parts.check(path)?;
                     parts
                 }
-                _ => read_mesh(path, before, &fits)?,
+                _ => read_mesh(path, left)?,
             };
             all.append(parts);
-            fits(all.memory_bytes())?;
+            room.fits(all.memory_bytes())?;
         }
         Ok(Self::from_parts(all))
     }
@@ -197,9 +189,9 @@ impl MeshScene {
         &self.cameras
     }
 
-    /// The light probe that a scene file names.
-    pub fn environment(&self) -> Option<&Path> {
-        self.environment.as_deref()
+    /// What surrounds it, where a scene file or a USD stage says so.
+    pub fn environment(&self) -> Option<&Surroundings> {
+        self.environment.as_ref()
     }
 
     /// Camera number `index`; the first of a file without cameras is one that sees everything ([`Camera::framing`]).
@@ -272,19 +264,16 @@ impl MeshScene {
     }
 }
 
-/// Reads and checks one mesh file; `fits` says whether so many bytes are to be had, of which `before` are taken.
-fn read_mesh(
-    path: &Path,
-    before: u64,
-    fits: &dyn Fn(u64) -> Result<(), PointsError>,
-) -> Result<SceneParts, PointsError> {
+/// Reads and checks one mesh file.
+fn read_mesh(path: &Path, room: Room) -> Result<SceneParts, PointsError> {
     // What is not there is reported by its reader.
     let length = std::fs::metadata(path).map_or(0, |metadata| metadata.len());
-    fits(before.saturating_add(length))?;
+    room.fits(length)?;
     let parts = match crate::open::extension(path).as_str() {
-        "gltf" | "glb" => gltf_file::read(path, &|bytes| fits(before.saturating_add(bytes)))?,
+        "gltf" | "glb" => gltf_file::read(path, room)?,
         "obj" => obj_file::read(path)?,
         "ply" => ply::mesh::read(path)?,
+        "usd" | "usda" | "usdc" | "usdz" => usd_file::read(path, room)?,
         other => {
             let what = format!("a mesh of kind {other:?}");
             let remedy = "convert it to .glb, .gltf, .obj or a .ply with faces";
@@ -295,15 +284,43 @@ fn read_mesh(
     Ok(parts)
 }
 
+/// Memory that a scene may take while it is read and indexed, and what of it is taken.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Room {
+    available: u64,
+    taken: u64,
+}
+
+impl Room {
+    pub(crate) fn new(available: u64) -> Self {
+        Self { available, taken: 0 }
+    }
+
+    /// What is left when so many more bytes are taken.
+    fn less(self, bytes: u64) -> Self {
+        Self {
+            taken: self.taken.saturating_add(bytes),
+            ..self
+        }
+    }
+
+    /// Whether so many bytes are to be had.
+    pub(crate) fn fits(&self, bytes: u64) -> Result<(), PointsError> {
+        let needed = self.taken.saturating_add(bytes);
+        match needed <= self.available {
+            true => Ok(()),
+            false => Err(PointsError::Memory {
+                what: "the geometry",
+                needed,
+                available: self.available,
+            }),
+        }
+    }
+}
+
 /// Bytes of a scene at its peak, while its charts and BVHs are made.
 fn memory_bytes(geometries: &[Geometry], instances: &[Instance], textures: &[Texture]) -> u64 {
-    let bytes = |geometry: &Geometry| {
-        let vertices = size_of_val(&geometry.positions[..])
-            + size_of_val(&geometry.normals[..])
-            + geometry.uvs.iter().map(|uvs| size_of_val(&uvs[..])).sum::<usize>();
-        vertices + geometry.triangles.len() * limits::TRIANGLE_BYTES
-    };
-    let geometry: usize = geometries.iter().map(bytes).sum();
+    let geometry: usize = geometries.iter().map(Geometry::memory_bytes).sum();
     let textures: usize = textures.iter().map(|texture| size_of_val(&texture.texels[..])).sum();
     (geometry + textures + instances.len() * limits::INSTANCE_BYTES) as u64
 }
@@ -311,6 +328,35 @@ fn memory_bytes(geometries: &[Geometry], instances: &[Instance], textures: &[Tex
 impl SceneParts {
     fn memory_bytes(&self) -> u64 {
         memory_bytes(&self.geometries, &self.instances, &self.textures)
+    }
+
+    /// Puts a geometry to its places: few triangles are copied into `world`, which [`Self::place_once`] takes in the end, for
+    /// one BVH is faster; many are kept once.
+    pub(crate) fn place(
+        &mut self,
+        path: &Path,
+        world: &mut Geometry,
+        local: Geometry,
+        places: &[DAffine3],
+    ) -> Result<(), PointsError> {
+        let placed = local.triangles.len().saturating_mul(places.len());
+        if places.len() == 1 || placed <= limits::COPIED_TRIANGLES_MAX {
+            return places.iter().try_for_each(|place| world.append(path, &local, place));
+        }
+        let geometry = self.geometries.len();
+        self.instances
+            .extend(places.iter().map(|place| Instance::new(geometry, place)));
+        self.geometries.push(local);
+        Ok(())
+    }
+
+    /// Takes a geometry that is in the world already.
+    pub(crate) fn place_once(&mut self, world: Geometry) {
+        if !world.triangles.is_empty() {
+            self.instances
+                .push(Instance::new(self.geometries.len(), &DAffine3::IDENTITY));
+            self.geometries.push(world);
+        }
     }
 
     pub(crate) fn append(&mut self, mut other: Self) {
@@ -370,6 +416,14 @@ impl SceneParts {
 }
 
 impl Geometry {
+    /// Bytes that it takes at its peak.
+    pub(crate) fn memory_bytes(&self) -> usize {
+        let vertices = size_of_val(&self.positions[..])
+            + size_of_val(&self.normals[..])
+            + self.uvs.iter().map(|uvs| size_of_val(&uvs[..])).sum::<usize>();
+        vertices + self.triangles.len() * limits::TRIANGLE_BYTES
+    }
+
     /// Corner positions in its own space.
     pub(crate) fn corners(&self, triangle: usize) -> [Vec3; 3] {
         self.triangles[triangle].map(|index| Vec3::from(self.positions[index as usize]))

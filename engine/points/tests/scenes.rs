@@ -126,7 +126,8 @@ fn an_environment_is_named_and_goes_with_the_scene() {
     let text = "[[mesh]]\nfile = \"square.ply\"\n[environment]\nfile = \"sky.hdr\"\n";
     let path = scene(folder.path(), text);
     let found = MeshScene::load(&path).unwrap();
-    assert_eq!(found.environment().unwrap(), folder.path().join("sky.hdr"));
+    let file = found.environment().unwrap().file();
+    assert_eq!(file.unwrap(), folder.path().join("sky.hdr"));
     assert_eq!(scene_meshes(&path).unwrap(), [folder.path().join("square.ply")]);
 }
 

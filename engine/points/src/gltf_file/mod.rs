@@ -11,20 +11,17 @@ mod nodes;
 
 use crate::error::PointsError;
 use crate::limits;
-use crate::scene::{Geometry, Instance, SceneParts};
+use crate::scene::{Geometry, Room, SceneParts};
 use accessor::Accessors;
 use glam::{DAffine3, DMat3, Vec3};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Meshes whose placed triangles are fewer than this are copied into the world rather than placed: one BVH is faster.
-const COPIED_TRIANGLES_MAX: usize = 100_000;
-
-/// Reads a file and all that it names, if its buffers' bytes are what `fits` lets pass.
-pub(crate) fn read(path: &Path, fits: &dyn Fn(u64) -> Result<(), PointsError>) -> Result<SceneParts, PointsError> {
+/// Reads a file and all that it names, if there is room for its buffers.
+pub(crate) fn read(path: &Path, room: Room) -> Result<SceneParts, PointsError> {
     let (document, blob) = buffers::open(path)?;
     let bytes = document.as_json().buffers.iter().map(|buffer| buffer.byte_length.0);
-    fits(bytes.fold(0, u64::saturating_add))?;
+    room.fits(bytes.fold(0, u64::saturating_add))?;
     let buffers = buffers::load(path, &document, blob)?;
     let visited = nodes::visit(path, &document)?;
     let (materials, textures) = materials::load(path, &document, &buffers)?;
@@ -47,26 +44,9 @@ pub(crate) fn read(path: &Path, fits: &dyn Fn(u64) -> Result<(), PointsError>) -
             continue;
         };
         let local = read_mesh(path, &accessors, &mesh, parts.materials.len())?;
-        let placed = local.triangles.len().saturating_mul(transforms.len());
-        if transforms.len() == 1 || placed <= COPIED_TRIANGLES_MAX {
-            transforms
-                .iter()
-                .try_for_each(|transform| world.append(path, &local, transform))?;
-            continue;
-        }
-        parts.instances.extend(
-            transforms
-                .iter()
-                .map(|place| Instance::new(parts.geometries.len(), place)),
-        );
-        parts.geometries.push(local);
+        parts.place(path, &mut world, local, transforms)?;
     }
-    if !world.triangles.is_empty() {
-        parts
-            .instances
-            .push(Instance::new(parts.geometries.len(), &DAffine3::IDENTITY));
-        parts.geometries.push(world);
-    }
+    parts.place_once(world);
     Ok(parts)
 }
 

@@ -5,7 +5,7 @@ use super::entries::{DirectionalLight, Lights, PointLight, RectangleLight, SpotL
 use crate::error::PointsError;
 use crate::light::{Light, LightKind};
 use crate::material::Material;
-use crate::scene::{Geometry, Instance, SceneParts};
+use crate::scene::{Geometry, SceneParts};
 use glam::{DAffine3, Vec3};
 
 /// Adds all lights to `parts`, and what is wrong with them to the problems of `text`.
@@ -26,12 +26,7 @@ pub(super) fn add(lights: &Lights, text: &mut Text<'_>, parts: &mut SceneParts) 
             parts.materials.push(material);
         }
     }
-    if !glowing.triangles.is_empty() {
-        parts
-            .instances
-            .push(Instance::new(parts.geometries.len(), &DAffine3::IDENTITY));
-        parts.geometries.push(glowing);
-    }
+    parts.place_once(glowing);
     Ok(())
 }
 

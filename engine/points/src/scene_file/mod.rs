@@ -10,6 +10,7 @@ use crate::limits;
 use crate::material::Material;
 use crate::named_file::beside;
 use crate::scene::{Instance, SceneParts};
+use crate::surroundings::Surroundings;
 use entries::{Description, Mesh, View};
 use glam::{DAffine3, Mat4, Vec3};
 use place::Transform;
@@ -32,6 +33,7 @@ pub(crate) fn read(
         .collect();
     let environment = description.environment.as_ref();
     let environment = environment.and_then(|environment| text.file(&environment.as_ref().file));
+    let environment = environment.map(Surroundings::picture);
     let mut parts = SceneParts {
         cameras,
         environment,
@@ -109,6 +111,8 @@ fn placed(mut parts: SceneParts, mesh: &Mesh, places: &[DAffine3]) -> SceneParts
             parts.cameras.extend(cameras.iter().map(|camera| camera.moved(place)));
         }
     }
+    let surroundings = parts.environment.take().filter(|_| mesh.lights);
+    parts.environment = surroundings.and_then(|all| Some(all.moved(places.first()?)));
     if let Some(albedo) = mesh.albedo {
         for material in &mut parts.materials {
             *material = Material {
@@ -233,7 +237,7 @@ impl<'a> Text<'a> {
 
 impl Camera {
     /// The camera where `place` brings it; scale is no part of a camera.
-    fn moved(&self, place: &DAffine3) -> Self {
+    pub(crate) fn moved(&self, place: &DAffine3) -> Self {
         let world = glam::DMat4::from(*place) * self.world_from_camera.as_dmat4();
         let axis = |index: usize| world.col(index).truncate().as_vec3();
         let back = axis(2).normalize_or(Vec3::Z);
