@@ -232,10 +232,9 @@ impl Step<'_> {
         let original = self.place.path.clone();
         let (dispatcher, mut abort) = (self.dispatcher.clone(), abort.clone());
         let stopper = tokio::spawn(async move {
-            // Ends without a word when nobody can stop it any more.
-            if abort.wait_for(|stop| *stop).await.is_ok() {
-                dispatcher.close_live(live);
-            }
+            // An error says that whoever waited has left, as a client of a stream may.
+            let _ = abort.wait_for(|stop| *stop).await;
+            dispatcher.close_live(live);
         });
         let outcome = tokio::task::spawn_blocking(move || gathering.run(&original)).await;
         stopper.abort();
