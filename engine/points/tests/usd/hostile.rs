@@ -78,7 +78,7 @@ fn what_would_never_end_is_refused() {
     let levels: String = (0..8)
         .map(|level| {
             let below = if level == 0 { "/Square".to_owned() } else { format!("/I{}", level - 1) };
-            let places = vec!["(0, 0, 0)"; 10].join(", ");
+            let places = ["(0, 0, 0)"; 10].join(", ");
             format!("def PointInstancer \"I{level}\" {{ rel prototypes = <{below}> int[] protoIndices = [0,0,0,0,0,0,0,0,0,0] point3f[] positions = [{places}] }}\n")
         })
         .collect();
