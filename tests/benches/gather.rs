@@ -1,8 +1,8 @@
 //! Error against time, of the gather and of ray casting the mesh, on the same receivers in one run and on one core.
 //!
 //! `cargo bench -p pbgi-tests --bench gather -- [spheres] [cornell] [sponza] [city] [forest]` (all by default; scenes whose files are
-//! absent are skipped, loudly). Errors are against rays at the mesh: two independent references per receiver, whose noise
-//! drops out of the mean of the product of both differences.
+//! absent are skipped, loudly). What it prints are the tables of `docs/gathering.md`. Errors are against rays at the mesh: two
+//! independent references per receiver, whose noise drops out of the mean of the product of both differences.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark asserts")]
 
@@ -240,15 +240,14 @@ fn measure(name: &str, file: &Path, points: u64, scratch: &Path) {
     let (info, mut source) = load(&output);
 
     println!(
-        "\n{name}: {} triangles, {} points, {} receivers",
+        "\n## {}{}\n\n{} triangles, {} points, {} receivers\n",
+        name[..1].to_uppercase(),
+        &name[1..],
         mesh.triangle_count(),
         info.point_count,
         all.len()
     );
-    println!(
-        "{:<36} {:>12} {:>14} {:>14}",
-        "method", "us/receiver", "occlusion RMS", "indirect RMS"
-    );
+    println!("| method | us a receiver | occlusion RMS | indirect RMS over mean | |\n|---|---|---|---|---|");
     let mut rows = Vec::new();
     for row in SETTINGS {
         rows.push(gather_row(&info, &mut source, &groups, &truth, row));
@@ -263,8 +262,8 @@ fn measure(name: &str, file: &Path, points: u64, scratch: &Path) {
             format!("{:.2} %", 100.0 * row.irradiance)
         };
         println!(
-            "{:<36} {:>12.1} {:>14.4} {:>14}   {}",
-            row.what, row.micros, row.occlusion, indirect, row.note
+            "| {} | {:.1} | {:.4} | {indirect} | {} |",
+            row.what, row.micros, row.occlusion, row.note
         );
     }
 }

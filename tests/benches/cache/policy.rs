@@ -326,30 +326,23 @@ pub(crate) fn print(scene: &Scene) {
         SIZE.0 * SIZE.1
     );
     println!(
-        "  cache of the scene   hits: this cache    exact LRU        clock   loads: this cache  exact LRU      clock"
-    );
-    let row = |label: &str, trace: &[Look], size: Size| {
-        let (ours, lru, clock) = (ours(trace, size, pages), lru(trace, size), clock(trace, size));
-        println!(
-            "  {label:<18} {:15.4} % {:10.4} % {:10.4} % {:18} {:10} {:10}",
-            ours.hit_ratio() * 100.0,
-            lru.hit_ratio() * 100.0,
-            clock.hit_ratio() * 100.0,
-            ours.all_loads(),
-            lru.all_loads(),
-            clock.all_loads()
-        );
-    };
-    for share in [0.02, 0.05, 0.1, 0.2, 0.5] {
-        row(&format!("{:.0} %", share * 100.0), &trace, Size::of(info, share));
-    }
-    println!(
-        "  while a third worker reads a scene {SCANNED_PAGES} times as large from end to end, a page of each kind every 8 looks:"
+        "\n| Cache, of the scene | this cache | exact LRU | clock | with the scan: this cache | exact LRU | clock |\n\
+         |---|---|---|---|---|---|---|"
     );
     let scanned = with_scan(&trace, pages);
-    for share in [0.05, 0.1, 0.2, 0.5] {
-        row(&format!("{:.0} %", share * 100.0), &scanned, Size::of(info, share));
+    for share in [0.02, 0.05, 0.1, 0.2, 0.5] {
+        let size = Size::of(info, share);
+        let hits = |trace: &[Look]| {
+            let outcomes = [ours(trace, size, pages), lru(trace, size), clock(trace, size)];
+            outcomes
+                .map(|outcome| format!("{:.2} %", outcome.hit_ratio() * 100.0))
+                .join(" | ")
+        };
+        println!("| {:.0} % | {} | {} |", share * 100.0, hits(&trace), hits(&scanned));
     }
+    println!(
+        "with the scan: a third worker reads a scene {SCANNED_PAGES} times as large, a page of each kind every 8 looks\n"
+    );
     println!(
         "  share of the frames that workers may pin, in a cache of a tenth: hits in the local and the shared part, loads"
     );
