@@ -341,7 +341,7 @@ pub(crate) fn print(scene: &Scene) {
         println!("| {:.0} % | {} | {} |", share * 100.0, hits(&trace), hits(&scanned));
     }
     println!(
-        "with the scan: a third worker reads a scene {SCANNED_PAGES} times as large, a page of each kind every 8 looks\n"
+        "\nwith the scan: a third worker reads a scene {SCANNED_PAGES} times as large, a page of each kind every 8 looks\n"
     );
     println!(
         "  share of the frames that workers may pin, in a cache of a tenth: hits in the local and the shared part, loads"
