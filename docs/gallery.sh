@@ -61,7 +61,7 @@ autzen() {
     local cloud
     cloud=$(data autzen autzen_10.6M_rgb.laz) || return 0
     pbgi build "$cloud" -o "$work/autzen.pbgi" --estimate-normals --radius auto --memory 512M
-    pbgi view "$work/autzen.pbgi" -o "$images/autzen.png" --overwrite --size 960x640 --memory 512M
+    pbgi view "$work/autzen.pbgi" -o "$images/autzen.png" --overwrite --size 720x480 --memory 512M
 }
 
 scenes=(demo court cornell sponza sponza_sky autzen)
