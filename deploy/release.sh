@@ -19,7 +19,7 @@ SOURCE_DATE_EPOCH=$(git log -1 --format=%ct)
 
 # Line tables stay in the building folder: they are most of a program's bytes.
 export CARGO_PROFILE_RELEASE_STRIP=debuginfo
-cargo zigbuild --release --locked --target "$target.$glibc"
+cargo zigbuild --release --locked --features usd --target "$target.$glibc"
 built=${CARGO_TARGET_DIR:-target}/$target/release
 
 stage=$(mktemp -d)
