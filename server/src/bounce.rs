@@ -28,7 +28,7 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 
 /// Folder of the scratch directory that holds the scenes.
@@ -117,8 +117,7 @@ async fn open(dispatcher: &Arc<Dispatcher>, scene: &Path) -> Result<Mounted, Job
     let (this, scene) = (dispatcher.clone(), scene.to_owned());
     blocking(move || {
         let mounted = this.mounts.open(&scene)?;
-        let now = SystemTime::UNIX_EPOCH + Duration::from_millis(telemetry::unix_millis().unsigned_abs());
-        let marked = File::open(&scene).and_then(|folder| folder.set_modified(now));
+        let marked = File::open(&scene).and_then(|folder| folder.set_modified(telemetry::now()));
         if let Err(error) = marked {
             tracing::debug!(%error, "cannot mark a scene of bounces as used");
         }
