@@ -14,7 +14,7 @@ use crate::limits;
 use crate::live::{self, LiveResult, TILE_RECEIVERS, VALUE_BYTES};
 use crate::mounts::Mounted;
 use crate::output;
-use crate::roots::Place;
+use crate::roots::{Place, Want};
 use crate::scheduler::JobNo;
 use crate::telemetry;
 use pbgi_core::limits::RASTER_RESOLUTION_DEFAULT;
@@ -187,7 +187,8 @@ impl Step<'_> {
         let started = Instant::now();
         let receivers = self.gather(&received.0, abort).await.map_err(failed)?;
         let gathered = started.elapsed().as_secs_f64();
-        let built = builder::run_child(self.dispatcher, self.job, &self.spec(&received.0), abort.clone()).await;
+        let spec = self.spec(&received.0)?;
+        let built = builder::run_child(self.dispatcher, self.job, &spec, abort.clone()).await;
         built.map_err(failed)?;
         let built = started.elapsed().as_secs_f64() - gathered;
         self.dispatcher.note(
@@ -241,13 +242,14 @@ impl Step<'_> {
         outcome.map_err(|error| error.to_string())?
     }
 
-    fn spec(&self, received: &Path) -> Spec {
+    fn spec(&self, received: &Path) -> Result<Spec, JobError> {
         let options = &self.dispatcher.config.options;
         let memory = &self.dispatcher.config.memory;
         let roots = self.dispatcher.roots();
         let scratch = options.scratch_dir.clone();
-        let scene = self.place.path.clone();
-        Spec {
+        // The place is this process's; the child needs the real path.
+        let scene = roots.real(&self.wanted.scene, Want::Read)?;
+        Ok(Spec {
             confine: (!roots.is_empty()).then(|| Confine {
                 read: vec![scene.clone(), scratch.clone()],
                 write: vec![scratch.clone()],
@@ -263,7 +265,7 @@ impl Step<'_> {
             memory_bytes: memory.build_bytes,
             data_limit_bytes: memory.total_bytes,
             daemon_pid: std::process::id(),
-        }
+        })
     }
 }
 

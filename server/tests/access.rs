@@ -59,6 +59,20 @@ fn build(input: &str, output: &str) -> Task {
     })
 }
 
+/// A picture with light that was reflected up to three times.
+fn shade_bounces(scene: &str, gbuffer: &str, output: &str) -> Task {
+    Task::Shade(v1::ShadeTask {
+        scene: scene.into(),
+        gbuffer: gbuffer.into(),
+        output: output.into(),
+        settings: Some(v1::ShadeSettings {
+            bounces: Some(3),
+            ..Default::default()
+        }),
+        ..Default::default()
+    })
+}
+
 fn shade(scene: &str, gbuffer: &str, output: &str) -> Task {
     Task::Shade(v1::ShadeTask {
         scene: scene.into(),
@@ -76,6 +90,27 @@ async fn jobs_stay_within_their_roots_and_errors_do_not_tell_where_these_are() {
     site.succeed("shade", shade("out:s.pbgi", "in:g.exr", "out:a.exr"))
         .await;
     check_picture(&folder.join("out/a.exr"), &site.gbuffer);
+    // Scenes of further bounces are made outside of all roots, from one that is in a root.
+    let grey = Task::Build(v1::BuildTask {
+        inputs: vec!["in:in.ply".into()],
+        output: "out:grey.pbgi".into(),
+        cloud: Some(v1::CloudSettings {
+            albedo: Some(0.5),
+            ..Default::default()
+        }),
+        ..Default::default()
+    });
+    site.succeed("grey", grey).await;
+    site.succeed("bounces", shade_bounces("out:grey.pbgi", "in:g.exr", "out:bounces.exr"))
+        .await;
+    check_picture(&folder.join("out/bounces.exr"), &site.gbuffer);
+    site.submit("black", shade_bounces("out:s.pbgi", "in:g.exr", "out:black.exr"))
+        .await
+        .unwrap();
+    let black = site.wait("black").await;
+    assert_eq!(black.state(), v1::JobState::Failed);
+    let hidden = !black.error.contains(&*folder.to_string_lossy()) && !black.error.contains("/proc");
+    assert!(hidden && black.error.contains("out:s.pbgi"), "{}", black.error);
     for (id, task, code) in [
         (
             "absolute",

@@ -128,8 +128,9 @@ pub struct ShadeSettings {
     pub bias: f32,
     /// How often light is reflected on its way at most (`bounces`). More than once takes a scene of its own for every bounce.
     pub bounces: u32,
-    /// Error within which receivers may be given what their neighbours on the same surface tell: of occlusion, and of irradiance
-    /// over that of the neighbours. 0 shades all.
+    /// Error within which neighbours on the same surface must tell what a receiver gets for others to be given that: of occlusion,
+    /// and of irradiance over that of the neighbours. It holds where receivers are shaded; what is smaller than the distance between
+    /// those may be missed. 0 shades all.
     pub interpolation: f32,
     /// Which sides of surfaces count. Light of a cluster without a plane cannot be told by sides: there, both send it.
     pub hit_sides: HitSides,

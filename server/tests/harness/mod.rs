@@ -179,10 +179,16 @@ impl Daemon {
         for name in ["run/jobs.sock", "run/queue.sock", "run/http.sock", "state/segment"] {
             assert!(self.folder.path().join(name).symlink_metadata().is_err(), "{name} left");
         }
-        assert_eq!(
-            std::fs::read_dir(self.folder.path().join("scratch")).unwrap().count(),
-            0
-        );
+        // Whole scenes of further bounces are kept, and nothing else.
+        let scratch = self.folder.path().join("scratch");
+        let names = |folder: &Path| {
+            let entries = std::fs::read_dir(folder).into_iter().flatten();
+            entries.map(|entry| entry.unwrap().path()).collect::<Vec<_>>()
+        };
+        let bounces = scratch.join("bounces");
+        assert!(names(&scratch).iter().all(|left| *left == bounces), "scratch left");
+        let whole = |path: &std::path::PathBuf| path.extension().is_some_and(|extension| extension == "pbgi");
+        assert!(names(&bounces).iter().all(whole), "half-made bounces left");
         for pid in children {
             assert!(!Path::new("/proc").join(pid.to_string()).is_dir(), "child {pid} left");
         }
