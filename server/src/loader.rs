@@ -59,18 +59,7 @@ impl Loader {
     }
 
     fn run(&self, seat: Seat, socket: &UnixStream) {
-        let outcome = loop {
-            match channel::receive::<PageRequest>(socket) {
-                Ok(Some(request)) => {
-                    let reply = self.answer(seat, &request);
-                    if let Err(error) = channel::send(socket, &reply) {
-                        break Err(error);
-                    }
-                }
-                Ok(None) => break Ok(()),
-                Err(error) => break Err(error),
-            }
-        };
+        let outcome = channel::serve(socket, |request| self.answer(seat, request));
         if let Err(error) = outcome {
             tracing::debug!(slot = seat.slot, epoch = seat.epoch, %error, "page channel failed");
         }
@@ -79,6 +68,12 @@ impl Loader {
 
     fn answer(&self, seat: Seat, request: &PageRequest) -> PageReply {
         let tile = self.dispatcher.tile_span(seat);
+        // The disk reads what comes after the first page meanwhile.
+        for key in request.keys.iter().skip(1) {
+            if let Some(mount) = self.mounts.get(key.mount) {
+                mount.scene().will_need(key.kind, key.page);
+            }
+        }
         let fetch = |&key: &PageKey| {
             let span = tracing::debug_span!(
                 parent: &tile,

@@ -15,7 +15,7 @@ use pbgi_core::{
     BuildSettings, NodeIndex, NodeRecord, PageKind, PageNo, PointIndex, PointRecord, SceneInfo, ShadeSettings,
 };
 use pbgi_points::{InputOptions, Kind, PlyForm, ProceduralScene, open_input, write_point_ply};
-use pbgi_shade::{Receiver, SceneSource, ShadeCounters, Shaded, Shader, SourceError};
+use pbgi_shade::{Receiver, SceneSource, ShadeCounters, Shaded, Shader, SourceError, Upcoming};
 use pbgi_store::{Overwrite, Scene};
 use pbgi_tests::forget;
 use std::collections::HashSet;
@@ -134,12 +134,18 @@ impl Paged {
 }
 
 impl SceneSource for Paged {
-    fn node(&mut self, index: NodeIndex, _receivers: u8) -> Result<&NodeRecord, SourceError> {
+    fn node(&mut self, index: NodeIndex, _: u8, _: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
         let (page, slot) = self.nodes.page(&self.scene, index.0, &mut self.waited);
         Ok(&page[slot])
     }
 
-    fn points(&mut self, first: PointIndex, count: u32, _receivers: u8) -> Result<&[PointRecord], SourceError> {
+    fn points(
+        &mut self,
+        first: PointIndex,
+        count: u32,
+        _: u8,
+        _: &impl Upcoming,
+    ) -> Result<&[PointRecord], SourceError> {
         let (page, slot) = self.points.page(&self.scene, first.0, &mut self.waited);
         Ok(&page[slot..(slot + count as usize).min(page.len())])
     }
@@ -218,7 +224,7 @@ impl Bench {
         for group in 0..groups {
             let first = (count / groups as f64 * group as f64) as u32;
             for index in first..first + GROUP as u32 {
-                let point = source.points(PointIndex(index), 1, 1).unwrap()[0];
+                let point = source.points(PointIndex(index), 1, 1, &()).unwrap()[0];
                 receivers.push(Receiver {
                     position: Vec3::from(point.position),
                     normal: point.normal(),

@@ -1,22 +1,25 @@
-//! Which pages a walk is about to need: those that hold the children of the nodes it is about to look at. They are asked for
-//! together with the next page that is missing, so that a cold walk waits once for several pages.
+//! Which pages a walk is about to need: it says where it will probably go, and what is not at hand of that is asked for together
+//! with the page that is missing, so that a cold walk waits once for several pages.
 //!
-//! Only while the local cache has room that nobody uses: not every child is looked at, and asking ahead at the expense of
-//! other pages tripled the loads of a scene three times the size of the cache (the bench `cache`, `costs`, 2026-11).
+//! Only while pages come slowly, from a disk: one that the operating system holds comes sooner than the walk has told its way.
 
 use pbgi_cache::LocalCache;
 use pbgi_cache::channel::REQUEST_PAGES_MAX;
-use pbgi_core::{MountId, NodeIndex, NodeKind, NodeRecord, PageKey, PageKind, PageNo, SceneInfo};
+use pbgi_core::{MountId, NodeIndex, NodeRecord, PageKey, PageKind, PageNo, SceneInfo};
+use pbgi_shade::{Upcoming, Wanted};
+use std::ops::ControlFlow;
+use std::time::Duration;
 
-/// Sibling groups that are looked at after a miss. When nothing has been missing for so long, looking ahead is a waste.
-const GROUPS_AFTER_MISS: u32 = 1024;
+/// A request takes this share of the local cache at most, where that has no free room: a walk is not always right.
+const SHARE: usize = 8;
 
-/// Pages wanted soon.
-#[derive(Debug, Default)]
-pub(crate) struct Ahead {
-    /// Newest last.
-    wanted: Vec<PageKey>,
-    groups_left: u32,
+/// What a request costs, and each of its pages, when the operating system holds them; a request that takes longer waited for
+/// a disk.
+const QUICK: (Duration, Duration) = (Duration::from_micros(60), Duration::from_micros(20));
+
+/// Whether a request for this many pages waited for a disk.
+pub(crate) fn waited_for_disk(pages: usize, took: Duration) -> bool {
+    took > QUICK.0 + QUICK.1 * pages as u32
 }
 
 /// Where the records of a scene lie.
@@ -40,81 +43,54 @@ impl Paging {
         }
     }
 
-    /// The page of a record; `None` if a forged scene points behind its end.
-    fn page(&self, kind: PageKind, index: u32) -> Option<PageKey> {
+    /// The page of a record and its place there; `None` if a forged scene points behind its end.
+    fn place(&self, kind: PageKind, index: u32) -> Option<(PageKey, usize)> {
         let (records, per_page) = match kind {
             PageKind::Node => (self.node_slots, self.nodes_per_page),
             PageKind::Point => (self.point_count, self.points_per_page),
         };
-        (u64::from(index) < records).then(|| PageKey {
+        let key = PageKey {
             mount: self.mount,
             kind,
             page: PageNo(index / per_page),
-        })
+        };
+        (u64::from(index) < records).then_some((key, (index % per_page) as usize))
     }
 }
 
-impl Ahead {
-    /// The walk is about to look at the nodes from `first` on, one for each bit of `mask`.
-    #[inline]
-    pub(crate) fn expect(&mut self, cache: &LocalCache, paging: &Paging, first: NodeIndex, mask: u8) {
-        if self.groups_left > 0 {
-            self.look(cache, paging, first, mask);
-        }
-    }
-
-    #[cold]
-    fn look(&mut self, cache: &LocalCache, paging: &Paging, first: NodeIndex, mask: u8) {
-        self.groups_left -= 1;
-        let Some(key) = paging.page(PageKind::Node, first.0) else {
-            return;
+/// The pages to ask for when `missing` is: that first, then those wanted soon, soonest first.
+pub(crate) fn request(cache: &LocalCache, paging: &Paging, missing: PageKey, upcoming: &impl Upcoming) -> Vec<PageKey> {
+    let mut keys = Vec::with_capacity(REQUEST_PAGES_MAX);
+    keys.push(missing);
+    let peek = |index: NodeIndex| {
+        let (key, slot) = paging.place(PageKind::Node, index.0)?;
+        let start = slot * size_of::<NodeRecord>();
+        let bytes = cache.peek(key)?.get(start..start + size_of::<NodeRecord>())?;
+        bytemuck::try_from_bytes(bytes).ok()
+    };
+    let want = |wanted| {
+        let place = match wanted {
+            Wanted::Node(index) => paging.place(PageKind::Node, index.0),
+            Wanted::Points(index) => paging.place(PageKind::Point, index.0),
         };
-        let Some(frame) = cache.peek(key) else {
-            return self.want(key);
-        };
-        let slot = (first.0 % paging.nodes_per_page) as usize;
-        let records = frame.chunks_exact(size_of::<NodeRecord>()).skip(slot);
-        for bytes in records.take(mask.count_ones() as usize) {
-            let Ok(node) = bytemuck::try_from_bytes::<NodeRecord>(bytes) else {
-                continue;
-            };
-            let next = match node.kind() {
-                NodeKind::Inner { first, .. } => paging.page(PageKind::Node, first.0),
-                NodeKind::Leaf { first, .. } => paging.page(PageKind::Point, first.0),
-                NodeKind::Overflow { .. } => None,
-            };
-            if let Some(next) = next.filter(|&next| next != key && cache.peek(next).is_none()) {
-                self.want(next);
-            }
-        }
-    }
-
-    fn want(&mut self, key: PageKey) {
-        if self.wanted.contains(&key) {
-            return;
-        }
-        if self.wanted.len() == REQUEST_PAGES_MAX - 1 {
-            self.wanted.remove(0);
-        }
-        self.wanted.push(key);
-    }
-
-    /// The pages to ask for with `missing`, which comes first. Looks ahead from now on, if there is room for what it finds.
-    pub(crate) fn request(&mut self, cache: &LocalCache, missing: PageKey) -> Vec<PageKey> {
-        let mut keys = vec![missing];
-        for key in self.wanted.drain(..).rev() {
+        if let Some((key, _)) = place {
             let asked = keys.iter().filter(|asked| asked.kind == key.kind).count();
-            if asked < room(cache, key.kind) && key != missing && cache.peek(key).is_none() {
+            if asked < room(cache, key.kind) && !keys.contains(&key) && cache.peek(key).is_none() {
                 keys.push(key);
             }
         }
-        let roomy = [PageKind::Node, PageKind::Point].map(|kind| room(cache, kind) > keys.len());
-        self.groups_left = if roomy.contains(&true) { GROUPS_AFTER_MISS } else { 0 };
-        keys
-    }
+        match keys.len() {
+            REQUEST_PAGES_MAX => ControlFlow::Break(()),
+            _ => ControlFlow::Continue(()),
+        }
+    };
+    // Broken off or not: the request is what it is.
+    let _ = upcoming.tell(peek, want);
+    keys
 }
 
-/// Pages of a kind that the local cache takes without letting go of others.
+/// Pages of a kind that one request may bring.
 fn room(cache: &LocalCache, kind: PageKind) -> usize {
-    cache.capacity(kind) - cache.len(kind)
+    let capacity = cache.capacity(kind);
+    (capacity - cache.len(kind)).max(capacity / SHARE)
 }

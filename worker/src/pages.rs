@@ -4,13 +4,13 @@
 //! is about to need (`ahead`). Indices come from files and
 //! are checked against the scene's counts, so that a forged scene ends in an error and nowhere else.
 
-use crate::ahead::{Ahead, Paging};
+use crate::ahead::{self, Paging};
 use crate::shading::FailureKind;
-use pbgi_cache::channel::{self, PageOutcome, PageReply, PageRequest};
+use pbgi_cache::channel::{self, PageOutcome, PageRequest};
 use pbgi_cache::{CacheError, LoadErrorKind, LocalCache, Origin};
 use pbgi_core::{MountId, NodeIndex, NodeRecord, PageKey, PageKind, PageNo, PointIndex, PointRecord, SceneInfo};
 use pbgi_proto::v1::TileCounters;
-use pbgi_shade::{SceneSource, SourceError};
+use pbgi_shade::{SceneSource, SourceError, Upcoming};
 use std::os::unix::net::UnixStream;
 use std::time::Instant;
 
@@ -20,7 +20,8 @@ pub struct Pages {
     cache: LocalCache,
     channel: UnixStream,
     requests: u64,
-    ahead: Ahead,
+    /// Whether the last request waited for a disk.
+    slow: bool,
 }
 
 impl Pages {
@@ -30,16 +31,12 @@ impl Pages {
             cache,
             channel,
             requests: 0,
-            ahead: Ahead::default(),
+            slow: false,
         }
     }
 
-    /// Has the daemon load a page, and others that will be needed soon, and adopts them. The missing page comes first.
-    #[cold]
-    fn load(&mut self, missing: PageKey, job: u64) -> Result<Vec<Origin>, Fault> {
-        let span = tracing::debug_span!("page load", kind = %missing.kind, page = missing.page.0);
-        let _entered = span.enter();
-        let keys = self.ahead.request(&self.cache, missing);
+    /// Has the daemon load pages, and adopts them. The first is the one that is missing; the others are needed soon.
+    fn load(&mut self, keys: Vec<PageKey>, job: u64) -> Result<Vec<Origin>, Fault> {
         // Before asking: the daemon pins the pages in this worker's name.
         for kind in [PageKind::Node, PageKind::Point] {
             match keys.iter().filter(|key| key.kind == kind).count() {
@@ -49,9 +46,8 @@ impl Pages {
         }
         self.requests += 1;
         let id = self.requests;
-        let request = PageRequest { id, job, keys };
-        channel::send(&self.channel, &request)?;
-        let reply: PageReply = channel::receive(&self.channel)?
+        let request = PageRequest::new(id, job, keys);
+        let reply = channel::ask(&self.channel, &request)?
             .ok_or_else(|| Fault(FailureKind::Io, "the daemon closed the page channel".to_owned()))?;
         if reply.id != id || reply.outcomes.len() != request.keys.len() {
             let text = format!("reply {} with {} pages to request {id}", reply.id, reply.outcomes.len());
@@ -201,18 +197,31 @@ impl<'a> PageSource<'a> {
 
     /// The place of a record, its page pinned.
     #[inline]
-    fn place(&mut self, kind: PageKind, index: u32, receivers: u8) -> Result<Place, SourceError> {
+    fn place(
+        &mut self,
+        kind: PageKind,
+        index: u32,
+        receivers: u8,
+        upcoming: &impl Upcoming,
+    ) -> Result<Place, SourceError> {
         self.accesses += u64::from(receivers.count_ones());
         match self.places[kind as usize] {
             // Still pinned: it is the page of this kind that was used last.
             Some(place) if index.wrapping_sub(place.first) < place.count && receivers & !place.receivers == 0 => {
                 Ok(place)
             }
-            _ => self.turn_to(kind, index, receivers),
+            _ => self.turn_to(kind, index, receivers, upcoming),
         }
     }
 
-    fn turn_to(&mut self, kind: PageKind, index: u32, receivers: u8) -> Result<Place, SourceError> {
+    #[inline(never)]
+    fn turn_to(
+        &mut self,
+        kind: PageKind,
+        index: u32,
+        receivers: u8,
+        upcoming: &impl Upcoming,
+    ) -> Result<Place, SourceError> {
         let pack = self.scene.pack;
         let mount = self.scene.mount;
         let file = match kind {
@@ -235,7 +244,7 @@ impl<'a> PageSource<'a> {
         let first = page * file.records_per_page;
         let count = (file.records - u64::from(first)).min(u64::from(file.records_per_page)) as u32;
         if self.pages.cache.get(key).is_none() {
-            self.load(key)?;
+            self.load(key, upcoming)?;
             self.pages.cache.get(key);
         }
         let before = self.places[kind as usize].filter(|place| place.key == key);
@@ -250,10 +259,19 @@ impl<'a> PageSource<'a> {
     }
 
     #[cold]
-    fn load(&mut self, key: PageKey) -> Result<(), SourceError> {
+    fn load(&mut self, missing: PageKey, upcoming: &impl Upcoming) -> Result<(), SourceError> {
+        let span = tracing::debug_span!("page load", kind = %missing.kind, page = missing.page.0);
+        let _entered = span.enter();
         let start = Instant::now();
-        let loaded = self.pages.load(key, self.job);
-        self.counters.io_nanos += start.elapsed().as_nanos() as u64;
+        let keys = match self.pages.slow {
+            true => ahead::request(&self.pages.cache, &self.scene.paging, missing, upcoming),
+            false => vec![missing],
+        };
+        let pages = keys.len();
+        let loaded = self.pages.load(keys, self.job);
+        let took = start.elapsed();
+        self.pages.slow = ahead::waited_for_disk(pages, took);
+        self.counters.io_nanos += took.as_nanos() as u64;
         // Other pages may have gone to make room.
         self.places = [None; 2];
         for origin in loaded.map_err(|fault| self.fail(fault))? {
@@ -284,40 +302,40 @@ impl<'a> PageSource<'a> {
     /// The bytes of the records `range` (within the page) of a page that `place` pinned.
     #[inline]
     fn bytes(&mut self, place: Place, start: usize, end: usize) -> Result<&[u8], SourceError> {
-        let frame = self.pages.cache.again(place.key);
+        let frame = self.pages.cache.again(place.key.kind);
         let bytes = frame.and_then(|frame| frame.get(start..end));
         bytes.ok_or_else(|| lost(place))
     }
 }
 
 impl SceneSource for PageSource<'_> {
-    #[inline]
-    fn node(&mut self, index: NodeIndex, receivers: u8) -> Result<&NodeRecord, SourceError> {
+    #[inline(always)]
+    fn node(&mut self, index: NodeIndex, receivers: u8, upcoming: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
         const BYTES: usize = size_of::<NodeRecord>();
-        let place = self.place(PageKind::Node, index.0, receivers)?;
+        let place = self.place(PageKind::Node, index.0, receivers, upcoming)?;
         let start = (index.0 - place.first) as usize * BYTES;
         let bytes = self.bytes(place, start, start + BYTES)?;
         bytemuck::try_from_bytes(bytes).map_err(|_| lost(place))
     }
 
     #[inline]
-    fn points(&mut self, first: PointIndex, count: u32, receivers: u8) -> Result<&[PointRecord], SourceError> {
+    fn points(
+        &mut self,
+        first: PointIndex,
+        count: u32,
+        receivers: u8,
+        upcoming: &impl Upcoming,
+    ) -> Result<&[PointRecord], SourceError> {
         const BYTES: usize = size_of::<PointRecord>();
         if count == 0 {
             return Err(self.fail(Fault(FailureKind::Corrupt, format!("no points from {} on", first.0))));
         }
-        let place = self.place(PageKind::Point, first.0, receivers)?;
+        let place = self.place(PageKind::Point, first.0, receivers, upcoming)?;
         let slot = first.0 - place.first;
         let count = count.min(place.count - slot);
         let start = slot as usize * BYTES;
         let bytes = self.bytes(place, start, start + count as usize * BYTES)?;
         bytemuck::try_cast_slice(bytes).map_err(|_| lost(place))
-    }
-
-    #[inline]
-    fn expect(&mut self, first: NodeIndex, mask: u8) {
-        let Pages { cache, ahead, .. } = &mut *self.pages;
-        ahead.expect(cache, &self.scene.paging, first, mask);
     }
 
     fn begin_pack(&mut self) {

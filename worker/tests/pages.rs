@@ -4,12 +4,16 @@
 
 use pbgi_cache::channel::{self, PageReply, PageRequest};
 use pbgi_cache::{CacheOwner, CacheView, LoadError, LoadErrorKind, LocalCache, PoolLayout, Segment, SegmentLayout};
-use pbgi_core::{BuildId, BuildSettings, MountId, NodeIndex, NodeRecord, PageKey, PageKind, PointIndex, SceneInfo};
-use pbgi_shade::{SceneSource, SourceError};
+use pbgi_core::{
+    BuildId, BuildSettings, MountId, NodeIndex, NodeKind, NodeRecord, PageKey, PageKind, PointIndex, SceneInfo,
+};
+use pbgi_shade::{SceneSource, SourceError, Upcoming, Wanted};
 use pbgi_worker::FailureKind;
 use pbgi_worker::pages::{PageSource, Pages, SceneView};
+use std::ops::ControlFlow;
 use std::os::unix::net::UnixStream;
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 const MOUNT: MountId = MountId { slot: 1, generation: 9 };
 const RECORDS_PER_PAGE: u32 = 16;
@@ -48,6 +52,8 @@ fn fill(page: &mut [u8], key: PageKey) -> Result<(), LoadError> {
         PageKind::Node => NODE_BYTES,
         PageKind::Point => POINT_BYTES,
     };
+    // As slow as a disk, so that the worker asks ahead.
+    std::thread::sleep(Duration::from_millis(2));
     page.fill(0);
     for (slot, record) in page.chunks_exact_mut(record_bytes).enumerate() {
         let index = (key.page.0 * RECORDS_PER_PAGE) as f32 + slot as f32;
@@ -75,11 +81,11 @@ fn daemon(local_frames: u32) -> (Pages, JoinHandle<CacheOwner>) {
     let (ours, theirs) = UnixStream::pair().unwrap();
     let thread = std::thread::spawn(move || {
         let seat = owner.seat(0).unwrap();
-        while let Some(request) = channel::receive::<PageRequest>(&ours).unwrap() {
+        let answer = |request: &PageRequest| {
             let fetch = |&key: &PageKey| owner.fetch(seat, key, request.job, |page| fill(page, key));
-            let reply = PageReply::new(request.id, request.keys.iter().map(fetch));
-            channel::send(&ours, &reply).unwrap();
-        }
+            PageReply::new(request.id, request.keys.iter().map(fetch))
+        };
+        channel::serve(&ours, answer).unwrap();
         owner
     });
     (Pages::new(LocalCache::new(view), theirs), thread)
@@ -93,10 +99,10 @@ fn every_index_gives_its_record_whatever_the_order() {
     source.begin_pack();
     for step in 0..4000u64 {
         let node = (step * 37 % NODES) as u32;
-        assert_eq!(source.node(NodeIndex(node), 1).unwrap().centroid[0], node as f32);
+        assert_eq!(source.node(NodeIndex(node), 1, &()).unwrap().centroid[0], node as f32);
         let point = (step * 53 % POINTS) as u32;
         if point / RECORDS_PER_PAGE != BAD_PAGE {
-            let points = source.points(PointIndex(point), 100, 1).unwrap();
+            let points = source.points(PointIndex(point), 100, 1, &()).unwrap();
             assert_eq!(points[0].position[0], point as f32);
             // Cut at the end of the page, and of the file.
             let rest = (RECORDS_PER_PAGE - point % RECORDS_PER_PAGE).min(POINTS as u32 - point);
@@ -117,18 +123,21 @@ fn an_index_out_of_range_is_corruption_not_a_panic() {
     source.begin_pack();
     for index in [NODES as u32, NODES as u32 + 2, 1 << 20, u32::MAX] {
         assert!(
-            matches!(source.node(NodeIndex(index), 1), Err(SourceError::Corrupt(_))),
+            matches!(source.node(NodeIndex(index), 1, &()), Err(SourceError::Corrupt(_))),
             "{index}"
         );
         assert_eq!(source.take_fault().unwrap().0, FailureKind::Corrupt);
     }
     for index in [POINTS as u32, u32::MAX] {
         assert!(
-            matches!(source.points(PointIndex(index), 1, 1), Err(SourceError::Corrupt(_))),
+            matches!(
+                source.points(PointIndex(index), 1, 1, &()),
+                Err(SourceError::Corrupt(_))
+            ),
             "{index}"
         );
     }
-    assert!(source.points(PointIndex(0), 0, 1).is_err());
+    assert!(source.points(PointIndex(0), 0, 1, &()).is_err());
     drop(pages);
     thread.join().unwrap();
 }
@@ -140,13 +149,13 @@ fn a_damaged_page_fails_with_the_daemons_words() {
     let mut source = PageSource::new(&mut pages, &mut view, 1);
     source.begin_pack();
     let bad = PointIndex(BAD_PAGE * RECORDS_PER_PAGE);
-    let error = source.points(bad, 1, 1).unwrap_err();
+    let error = source.points(bad, 1, 1, &()).unwrap_err();
     assert!(matches!(error, SourceError::Corrupt(_)), "{error}");
     let (kind, text) = source.take_fault().unwrap();
     assert_eq!(kind, FailureKind::Corrupt);
     assert!(text.contains("checksum"), "{text}");
     // The next page is unaffected.
-    assert!(source.points(PointIndex(0), 1, 1).is_ok());
+    assert!(source.points(PointIndex(0), 1, 1, &()).is_ok());
     drop(pages);
     thread.join().unwrap();
 }
@@ -160,7 +169,7 @@ fn counters_add_up_and_a_receiver_pays_for_a_page_once() {
         let mut source = PageSource::new(&mut pages, &mut view, 1);
         source.begin_pack();
         for index in [0, 1, 20, 2] {
-            source.node(NodeIndex(index), 1).unwrap();
+            source.node(NodeIndex(index), 1, &()).unwrap();
         }
         let counters = source.counters();
         assert_eq!(
@@ -170,12 +179,12 @@ fn counters_add_up_and_a_receiver_pays_for_a_page_once() {
         assert_eq!(counters.traversal_bytes, 2 * page_bytes);
         assert!(counters.io_nanos > 0);
         source.begin_pack();
-        source.node(NodeIndex(3), 1).unwrap();
+        source.node(NodeIndex(3), 1, &()).unwrap();
         assert_eq!(source.counters().traversal_bytes, 3 * page_bytes);
     }
     let mut source = PageSource::new(&mut pages, &mut view, 2);
     source.begin_pack();
-    source.node(NodeIndex(4), 1).unwrap();
+    source.node(NodeIndex(4), 1, &()).unwrap();
     let counters = source.counters();
     assert_eq!(
         (counters.cache_misses, counters.local_hits),
@@ -186,25 +195,51 @@ fn counters_add_up_and_a_receiver_pays_for_a_page_once() {
     thread.join().unwrap();
 }
 
+/// A walk that will open the nodes of the first page, in their order.
+struct FirstPage;
+
+impl Upcoming for FirstPage {
+    fn tell<'a>(
+        &self,
+        peek: impl Fn(NodeIndex) -> Option<&'a NodeRecord>,
+        mut want: impl FnMut(Wanted) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
+        for index in (0..RECORDS_PER_PAGE).map(NodeIndex) {
+            let child = peek(index).map(|node| match node.kind() {
+                NodeKind::Inner { first, .. } => first,
+                _ => panic!("all nodes have children"),
+            });
+            want(Wanted::Node(child.unwrap_or(index)))?;
+        }
+        ControlFlow::Continue(())
+    }
+}
+
 #[test]
-fn pages_expected_soon_come_with_the_missing_one_and_push_out_nothing() {
-    for (local_frames, ahead) in [(16, 8), (4, 2)] {
+fn pages_needed_soon_come_with_the_missing_one_as_far_as_there_is_room() {
+    // An eighth of a full cache may go for them.
+    for (local_frames, ahead, when_full) in [(32, 15, None), (16, 14, Some(1)), (4, 2, Some(0))] {
         let (mut pages, thread) = daemon(local_frames);
         let mut view = SceneView::new(&scene(), MOUNT);
         let mut source = PageSource::new(&mut pages, &mut view, 1);
         source.begin_pack();
-        source.node(NodeIndex(0), 1).unwrap();
+        source.node(NodeIndex(0), 1, &()).unwrap();
         assert_eq!(source.counters().cache_misses, 1);
-        // Their children are on the pages 1 to 8.
-        source.expect(NodeIndex(0), 0xff);
-        source.node(NodeIndex(9 * RECORDS_PER_PAGE), 1).unwrap();
+        // Their children are on the pages 1 to 16.
+        source.node(NodeIndex(18 * RECORDS_PER_PAGE), 1, &FirstPage).unwrap();
         assert_eq!(source.counters().cache_misses, 2 + ahead, "{local_frames} frames");
-        // The first page is still held; so are the expected ones, latest first.
-        for page in std::iter::once(0).chain(9 - ahead as u32..=9) {
-            source.node(NodeIndex(page * RECORDS_PER_PAGE), 1).unwrap();
+        // The first page is still held; so are those needed soonest.
+        for page in (1..=ahead as u32).chain([18, 0]) {
+            source.node(NodeIndex(page * RECORDS_PER_PAGE), 1, &()).unwrap();
         }
         let counters = source.counters();
         assert_eq!((counters.cache_misses, counters.shared_hits), (2 + ahead, 0));
+        if let Some(when_full) = when_full {
+            source.node(NodeIndex(19 * RECORDS_PER_PAGE), 1, &FirstPage).unwrap();
+            let after = source.counters();
+            let came = after.cache_misses + after.shared_hits - counters.cache_misses;
+            assert_eq!(came, 1 + when_full, "{local_frames} frames, all in use");
+        }
         drop(pages);
         assert_eq!(thread.join().unwrap().counters().node.redundant_reads, 0);
     }

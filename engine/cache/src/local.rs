@@ -73,22 +73,19 @@ impl LocalCache {
         } else {
             self.find(key)?
         };
-        self.pools[key.kind as usize].last = Some((tag, frame));
+        self.pools[key.kind as usize].last = Some(frame);
         // SAFETY: Rule 4: the frame is in the local cache, so its pin is held; pins are given up only by methods that
         // borrow `self` exclusively, which the result's lifetime forbids.
         Some(unsafe { self.view.frame(key.kind, frame) })
     }
 
-    /// The page, if it is the one of its kind that [`Self::get`] gave last. Costs next to nothing, and is not counted: the page
-    /// is the most recently used one already.
-    #[inline]
-    pub fn again(&self, key: PageKey) -> Option<&[u8]> {
-        let (tag, frame) = self.pools[key.kind as usize].last?;
-        if tag != Tag::resident(key) {
-            return None;
-        }
+    /// The page of a kind that [`Self::get`] gave last, while it is held. Costs next to nothing, and is not counted: the page is
+    /// the most recently used one already.
+    #[inline(always)]
+    pub fn again(&self, kind: PageKind) -> Option<&[u8]> {
+        let frame = self.pools[kind as usize].last?;
         // SAFETY: Rule 4, as in `get`: `release` forgets the frame with its pin.
-        Some(unsafe { self.view.frame(key.kind, frame) })
+        Some(unsafe { self.view.frame(kind, frame) })
     }
 
     /// The page, if it is in the local cache; it is not counted as a use.
@@ -148,7 +145,7 @@ impl LocalCache {
         if entry.tag == tag {
             *entry = FrontEntry::EMPTY;
         }
-        if pool.last == Some((tag, frame)) {
+        if pool.last == Some(frame) {
             pool.last = None;
         }
         self.view.unpin(kind, frame);
@@ -254,7 +251,7 @@ struct LocalPool {
     now: u64,
     replayed: u64,
     /// What was given out last.
-    last: Option<(Tag, FrameId)>,
+    last: Option<FrameId>,
 }
 
 #[derive(Clone, Copy, Debug)]

@@ -7,7 +7,7 @@
 
 mod support;
 
-use pbgi_cache::channel::{PageOutcome, PageReply, PageRequest, Welcome, receive, send};
+use pbgi_cache::channel::{PageOutcome, PageReply, PageRequest, Welcome, ask, receive, send};
 use pbgi_cache::{CacheError, CacheOwner, CacheView, LocalCache, Seat};
 use pbgi_core::{PageKey, PageKind};
 use rand::rngs::StdRng;
@@ -96,15 +96,8 @@ impl Worker {
     /// Asks the owner for a page; false if the owner is gone. The request's number is the count of verified pins.
     fn ask(&mut self, key: PageKey) -> bool {
         self.cache.reserve(key.kind, 1);
-        let request = PageRequest {
-            id: self.verified,
-            job: u64::from(self.cache.view().slot()),
-            keys: vec![key],
-        };
-        if send(&self.channel, &request).is_err() {
-            return false;
-        }
-        let Ok(Some(reply)) = receive::<PageReply>(&self.channel) else {
+        let job = u64::from(self.cache.view().slot());
+        let Ok(Some(reply)) = ask(&self.channel, &PageRequest::new(self.verified, job, vec![key])) else {
             return false;
         };
         match reply.outcomes[..] {

@@ -11,11 +11,12 @@ use crate::painter::Painter;
 use crate::raster::{Raster, RasterTables};
 use crate::shader::{Receiver, ShadeCounters, ShadeError};
 use crate::simd::{Floats, LANES, Words};
-use crate::source::{SceneSource, SourceError};
+use crate::source::{SceneSource, SourceError, Upcoming, Wanted};
 use crate::vector::{Frames, Vector};
 use glam::{DVec3, Vec3};
 use pbgi_core::limits::{CUT_NODES_MAX, MORTON_BITS};
 use pbgi_core::{NodeIndex, NodeKind, NodeRecord, PointIndex, PointRecord, SceneInfo, ShadeSettings};
+use std::ops::ControlFlow;
 
 /// Octants by distance from the nearest, as differences in bits.
 const NEAR_TO_FAR: [u32; 8] = [0, 1, 2, 4, 3, 5, 6, 7];
@@ -35,6 +36,17 @@ pub(crate) struct Pack<F> {
     lanes: u8,
     /// The root's centre relative to the receivers.
     root: Vector<F>,
+    /// One receiver, for guesses at what all of them will do.
+    leader: Leader,
+}
+
+/// One receiver of a pack.
+#[derive(Clone, Copy)]
+struct Leader {
+    position: Vec3,
+    normal: Vec3,
+    /// The root's centre relative to it.
+    root: Vec3,
 }
 
 /// A voxel to visit.
@@ -51,6 +63,20 @@ pub(crate) struct Visit {
     pub(crate) radius: f32,
     /// Receivers that visit it, one bit each.
     pub(crate) lanes: u8,
+}
+
+impl Visit {
+    /// How far its points' discs reach from its centre.
+    #[inline(always)]
+    pub(crate) fn reach(&self) -> f32 {
+        self.half * 1.732_051 + self.radius
+    }
+
+    /// Squared distance from its centre up to which it is always opened: receivers that may be inside.
+    #[inline(always)]
+    fn apart_squared(&self) -> f32 {
+        3.6 * self.half * self.half
+    }
 }
 
 /// Memory that walks use again and again.
@@ -82,6 +108,11 @@ impl<F: Floats> Pack<F> {
             frames: Frames::new(frames),
             lanes: (u8::MAX as u32 >> (LANES - receivers.len().min(LANES))) as u8,
             root: Vector::from_array(std::array::from_fn(root)),
+            leader: Leader {
+                position: receiver(0).position,
+                normal: receiver(0).normal,
+                root: root(0),
+            },
         }
     }
 
@@ -89,6 +120,40 @@ impl<F: Floats> Pack<F> {
     #[inline(always)]
     pub(crate) fn relative(&self, place: Vec3) -> Vector<F> {
         Vector::splat(place) - self.position
+    }
+}
+
+/// What a gather has before it.
+struct Pending<'a> {
+    walk: &'a Walk<'a>,
+    leader: Leader,
+    stack: &'a [Visit],
+}
+
+impl Upcoming for Pending<'_> {
+    fn tell<'a>(
+        &self,
+        peek: impl Fn(NodeIndex) -> Option<&'a NodeRecord>,
+        mut want: impl FnMut(Wanted) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
+        for visit in self.stack.iter().rev() {
+            let center = self.leader.root + visit.offset;
+            if self.leader.normal.dot(center) < -visit.reach() {
+                continue;
+            }
+            let Some(node) = peek(visit.index) else {
+                want(Wanted::Node(visit.index))?;
+                continue;
+            };
+            let cluster = Cluster::new(node, 2.0 * visit.half);
+            let (from, _) = cluster.accepted_from_squared(self.walk.settings.max_solid_angle);
+            let distance = (cluster.centroid - self.leader.position).length_squared();
+            let whole = matches!(node.kind(), NodeKind::Leaf { .. }) && cluster.fills_section();
+            if !whole && (distance <= from || center.length_squared() <= visit.apart_squared()) {
+                Wanted::below(node).map_or(ControlFlow::Continue(()), &mut want)?;
+            }
+        }
+        ControlFlow::Continue(())
     }
 }
 
@@ -137,9 +202,15 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
         }
         let lane_count = u64::from(lanes.count_ones());
         counters.nodes_visited += lane_count;
-        let node = *source.node(visit.index, lanes)?;
-        check(&node, &visit, walk.info.settings.leaf_max)?;
-        let cluster = Cluster::new(&node, 2.0 * visit.half);
+        let pending = Pending {
+            walk,
+            leader: pack.leader,
+            stack,
+        };
+        let node = source.node(visit.index, lanes, &pending)?;
+        check(node, &visit, walk.info.settings.leaf_max)?;
+        let radius = visit.radius.min(node.radius_ratio() * 2.0 * visit.half);
+        let cluster = Cluster::new(node, 2.0 * visit.half);
         let centroid = pack.relative(cluster.centroid);
         let kind = node.kind();
         let whole = match kind {
@@ -150,7 +221,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
         let accepted = if whole {
             lanes
         } else {
-            let apart = F::splat(3.6 * visit.half * visit.half).less(center.length_squared());
+            let apart = F::splat(visit.apart_squared()).less(center.length_squared());
             let (from, from_stretched) = cluster.accepted_from_squared(walk.settings.max_solid_angle);
             let distance = centroid.length_squared();
             let accepted = lanes & (apart & F::splat(from).less(distance)).lanes();
@@ -171,7 +242,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
         }
         if let NodeKind::Leaf { first, count } = kind {
             counters.cut_elements += u64::from(count) * u64::from(opened.count_ones());
-            read_points(source, first, count, opened, points)?;
+            read_points(source, first, count, opened, &pending, points)?;
             let voxel = Cube {
                 center: (middle + visit.offset.as_dvec3()).as_vec3(),
                 half: visit.half,
@@ -197,8 +268,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
             opened &= !together;
             match kind {
                 NodeKind::Inner { first, mask } => {
-                    source.expect(first, mask);
-                    push_children(stack, &visit, &node, first, mask, near, together);
+                    push_children(stack, &visit, radius, first, mask, near, together);
                 }
                 _ => painter.draw_parts(parts, order, &visit, near, together),
             }
@@ -228,18 +298,18 @@ pub(crate) fn check(node: &NodeRecord, visit: &Visit, leaf_max: u32) -> Result<(
     }
 }
 
-/// Pushes the children for receivers to whom octant `near` is the nearest, so that it is popped first.
+/// Pushes the children for receivers to whom octant `near` is the nearest, so that it is popped first. No point of theirs
+/// is larger than `radius`.
 #[inline(always)]
 pub(crate) fn push_children(
     stack: &mut Vec<Visit>,
     visit: &Visit,
-    node: &NodeRecord,
+    radius: f32,
     first: NodeIndex,
     mask: u8,
     near: u32,
     lanes: u8,
 ) {
-    let radius = visit.radius.min(node.radius_ratio() * 2.0 * visit.half);
     let half = visit.half * 0.5;
     for step in NEAR_TO_FAR.iter().rev() {
         let octant = near ^ step;
@@ -267,12 +337,14 @@ pub(crate) fn read_points<S: SceneSource>(
     first: PointIndex,
     count: u32,
     lanes: u8,
+    upcoming: &impl Upcoming,
     points: &mut Vec<PointRecord>,
 ) -> Result<(), SourceError> {
     points.clear();
     while (points.len() as u32) < count {
         let read = points.len() as u32;
-        points.extend_from_slice(source.points(PointIndex(first.0.wrapping_add(read)), count - read, lanes)?);
+        let first = PointIndex(first.0.wrapping_add(read));
+        points.extend_from_slice(source.points(first, count - read, lanes, upcoming)?);
     }
     Ok(())
 }

@@ -23,4 +23,4 @@ mod vector;
 
 pub use primary::{Hit, Ray, Tracer};
 pub use shader::{Receiver, ShadeCounters, ShadeError, Shaded, Shader};
-pub use source::{ArraySource, SceneSource, SourceError};
+pub use source::{ArraySource, SceneSource, SourceError, Upcoming, Wanted};

@@ -60,7 +60,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
     /// `center` is the voxel's, relative to the receivers.
     #[inline(always)]
     pub(crate) fn seen_by(&self, visit: &Visit, center: Vector<F>) -> u8 {
-        let reach = visit.half * 1.732_051 + visit.radius;
+        let reach = visit.reach();
         let below = self.pack.frames.z.dot(center).less(F::splat(-reach));
         let bits = self.walk.tables.bits();
         let covered = self.raster.covered_count();

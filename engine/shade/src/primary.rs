@@ -7,12 +7,13 @@
 
 use crate::cut::{Visit, check, push_children, read_points};
 use crate::shader::{ShadeCounters, ShadeError};
-use crate::source::SceneSource;
+use crate::source::{SceneSource, Upcoming, Wanted};
 use bytemuck::{Pod, Zeroable};
 use glam::{DVec3, Vec3};
 use pbgi_core::limits::CUT_NODES_MAX;
 use pbgi_core::sh::basis;
-use pbgi_core::{NodeKind, NodeRecord, PointRecord, SceneInfo};
+use pbgi_core::{NodeIndex, NodeKind, NodeRecord, PointRecord, SceneInfo};
+use std::ops::ControlFlow;
 
 /// Rays that walk together.
 const PACKET_RAYS: usize = 64;
@@ -172,10 +173,7 @@ impl Tracer {
         let mut visited = 0;
         while let Some(visit) = self.stack.pop() {
             let center = middle + visit.offset;
-            let distance = center.length();
-            let pixel = self.pixel_angle * distance;
-            let reach = visit.half * 3f32.sqrt() + KERNEL_RADII * visit.radius + KERNEL_PIXELS * pixel;
-            if !packet.may_meet(center, distance, reach) {
+            if !packet.may_see(&visit, center) {
                 continue;
             }
             visited += 1;
@@ -183,18 +181,23 @@ impl Tracer {
                 return Err(ShadeError::Budget { nodes: CUT_NODES_MAX });
             }
             self.counters.nodes_visited += 1;
-            let node = *source.node(visit.index, 1)?;
-            check(&node, &visit, self.info.settings.leaf_max)?;
-            let small = 2.0 * visit.half <= NODE_PIXELS * pixel && distance > 2.0 * visit.half;
+            let pending = Pending {
+                packet,
+                middle,
+                stack: &self.stack,
+            };
+            let node = source.node(visit.index, 1, &pending)?;
+            check(node, &visit, self.info.settings.leaf_max)?;
+            let small = packet.is_small(&visit, center);
             match node.kind() {
                 NodeKind::Inner { first, mask } if !small => {
-                    source.expect(first, mask);
+                    let radius = visit.radius.min(node.radius_ratio() * 2.0 * visit.half);
                     let side = |axis: f32, bit: u32| u32::from(axis < 0.0) << bit;
                     let near = side(center.x, 0) | side(center.y, 1) | side(center.z, 2);
-                    push_children(&mut self.stack, &visit, &node, first, mask, near, 1);
+                    push_children(&mut self.stack, &visit, radius, first, mask, near, 1);
                 }
                 NodeKind::Leaf { first, count } if !small => {
-                    read_points(source, first, count, 1, &mut self.points)?;
+                    read_points(source, first, count, 1, &pending, &mut self.points)?;
                     for point in &self.points {
                         let disc = Disc::of_point(point, packet.origin);
                         if packet.take(&disc) {
@@ -203,7 +206,7 @@ impl Tracer {
                     }
                 }
                 _ => {
-                    let disc = Disc::of_node(&node, visit.half, packet.origin);
+                    let disc = Disc::of_node(node, visit.half, packet.origin);
                     if packet.take(&disc) {
                         self.discs.push(disc);
                     }
@@ -212,6 +215,36 @@ impl Tracer {
         }
         self.counters.cut_elements += self.discs.len() as u64;
         Ok(())
+    }
+}
+
+/// What a packet has before it.
+struct Pending<'a> {
+    packet: &'a Packet<'a>,
+    /// The root's centre relative to the origin.
+    middle: Vec3,
+    stack: &'a [Visit],
+}
+
+impl Upcoming for Pending<'_> {
+    fn tell<'a>(
+        &self,
+        peek: impl Fn(NodeIndex) -> Option<&'a NodeRecord>,
+        mut want: impl FnMut(Wanted) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
+        for visit in self.stack.iter().rev() {
+            let center = self.middle + visit.offset;
+            if !self.packet.may_see(visit, center) {
+                continue;
+            }
+            let wanted = match peek(visit.index) {
+                None => Some(Wanted::Node(visit.index)),
+                Some(node) if !self.packet.is_small(visit, center) => Wanted::below(node),
+                Some(_) => None,
+            };
+            wanted.map_or(ControlFlow::Continue(()), &mut want)?;
+        }
+        ControlFlow::Continue(())
     }
 }
 
@@ -236,6 +269,20 @@ impl<'a> Packet<'a> {
             pixel_angle,
             front: [(f32::INFINITY, 0.0); PACKET_RAYS],
         })
+    }
+
+    /// Whether a ray may meet something of a voxel around `center`, relative to the origin.
+    fn may_see(&self, visit: &Visit, center: Vec3) -> bool {
+        let distance = center.length();
+        let pixel = self.pixel_angle * distance;
+        let reach = visit.half * 3f32.sqrt() + KERNEL_RADII * visit.radius + KERNEL_PIXELS * pixel;
+        self.may_meet(center, distance, reach)
+    }
+
+    /// Whether a voxel is drawn whole.
+    fn is_small(&self, visit: &Visit, center: Vec3) -> bool {
+        let distance = center.length();
+        2.0 * visit.half <= NODE_PIXELS * self.pixel_angle * distance && distance > 2.0 * visit.half
     }
 
     /// Whether a ball may touch a ray before that has met a disc.

@@ -1,6 +1,7 @@
 //! Where the shading code gets nodes and points from: an index in, a slice of a page out.
 
-use pbgi_core::{NodeIndex, NodeRecord, PointIndex, PointRecord};
+use pbgi_core::{NodeIndex, NodeKind, NodeRecord, PointIndex, PointRecord};
+use std::ops::ControlFlow;
 
 /// Pages of a scene, behind whatever caches there are. Slices are valid until the next call, so that a cache of a single
 /// page is enough.
@@ -9,23 +10,63 @@ pub trait SceneSource {
     ///
     /// # Errors
     /// The index is out of range, or its page cannot be had.
-    fn node(&mut self, index: NodeIndex, receivers: u8) -> Result<&NodeRecord, SourceError>;
+    fn node(&mut self, index: NodeIndex, receivers: u8, upcoming: &impl Upcoming) -> Result<&NodeRecord, SourceError>;
 
     /// The points from `first` on, for some receivers: at least one, at most `count`, cut where their page ends.
     ///
     /// # Errors
     /// The range is out of bounds, or its page cannot be had.
-    fn points(&mut self, first: PointIndex, count: u32, receivers: u8) -> Result<&[PointRecord], SourceError>;
-
-    /// A walk is about to look at the siblings from `first` on, one for each bit of `mask`: a hint, for a source that has
-    /// to fetch pages.
-    #[inline]
-    fn expect(&mut self, first: NodeIndex, mask: u8) {
-        let _ = (first, mask);
-    }
+    fn points(
+        &mut self,
+        first: PointIndex,
+        count: u32,
+        receivers: u8,
+        upcoming: &impl Upcoming,
+    ) -> Result<&[PointRecord], SourceError>;
 
     /// Another pack of receivers begins: what is counted per receiver starts anew.
     fn begin_pack(&mut self) {}
+}
+
+/// What a walk will probably look at next: a source that has to fetch a page asks, and fetches others with it. `()` tells
+/// nothing.
+pub trait Upcoming {
+    /// Tells `want`, soonest first, until that breaks off. Of a node that `peek` has at hand, what it leads to is told.
+    fn tell<'a>(
+        &self,
+        peek: impl Fn(NodeIndex) -> Option<&'a NodeRecord>,
+        want: impl FnMut(Wanted) -> ControlFlow<()>,
+    ) -> ControlFlow<()>;
+}
+
+/// What a walk wants to look at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Wanted {
+    /// A node, the first of its siblings.
+    Node(NodeIndex),
+    /// Points of a leaf, the first of them.
+    Points(PointIndex),
+}
+
+impl Wanted {
+    /// Where an opened node leads; `None` at the bottom.
+    pub(crate) fn below(node: &NodeRecord) -> Option<Self> {
+        match node.kind() {
+            NodeKind::Inner { first, .. } => Some(Self::Node(first)),
+            NodeKind::Leaf { first, .. } => Some(Self::Points(first)),
+            NodeKind::Overflow { .. } => None,
+        }
+    }
+}
+
+impl Upcoming for () {
+    fn tell<'a>(
+        &self,
+        _peek: impl Fn(NodeIndex) -> Option<&'a NodeRecord>,
+        _want: impl FnMut(Wanted) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
+        ControlFlow::Continue(())
+    }
 }
 
 /// Why a page did not come.
@@ -51,13 +92,19 @@ pub struct ArraySource {
 
 impl SceneSource for ArraySource {
     #[inline]
-    fn node(&mut self, index: NodeIndex, _receivers: u8) -> Result<&NodeRecord, SourceError> {
+    fn node(&mut self, index: NodeIndex, _: u8, _: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
         let missing = || SourceError::Corrupt(format!("node {} of {}", index.0, self.nodes.len()));
         self.nodes.get(index.0 as usize).ok_or_else(missing)
     }
 
     #[inline]
-    fn points(&mut self, first: PointIndex, count: u32, _receivers: u8) -> Result<&[PointRecord], SourceError> {
+    fn points(
+        &mut self,
+        first: PointIndex,
+        count: u32,
+        _: u8,
+        _: &impl Upcoming,
+    ) -> Result<&[PointRecord], SourceError> {
         let missing = || SourceError::Corrupt(format!("points {} + {count} of {}", first.0, self.points.len()));
         let start = first.0 as usize;
         self.points

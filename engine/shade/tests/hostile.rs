@@ -10,7 +10,7 @@ use glam::Vec3;
 use pbgi_core::limits::{CUT_NODES_MAX, MORTON_BITS};
 use pbgi_core::node::NodeAttributes;
 use pbgi_core::{NodeIndex, NodeKind, NodeRecord, PointIndex, PointRecord, SceneInfo, ShadeSettings};
-use pbgi_shade::{ArraySource, Receiver, SceneSource, ShadeError, Shaded, Shader, SourceError};
+use pbgi_shade::{ArraySource, Receiver, SceneSource, ShadeError, Shaded, Shader, SourceError, Upcoming};
 use std::time::{Duration, Instant};
 
 /// SplitMix64.
@@ -63,14 +63,20 @@ struct Counting {
 }
 
 impl SceneSource for Counting {
-    fn node(&mut self, index: NodeIndex, receivers: u8) -> Result<&NodeRecord, SourceError> {
+    fn node(&mut self, index: NodeIndex, receivers: u8, upcoming: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
         self.nodes += u64::from(receivers.count_ones());
-        self.inner.node(index, receivers)
+        self.inner.node(index, receivers, upcoming)
     }
 
-    fn points(&mut self, first: PointIndex, count: u32, receivers: u8) -> Result<&[PointRecord], SourceError> {
+    fn points(
+        &mut self,
+        first: PointIndex,
+        count: u32,
+        receivers: u8,
+        upcoming: &impl Upcoming,
+    ) -> Result<&[PointRecord], SourceError> {
         self.points += u64::from(count);
-        self.inner.points(first, count, receivers)
+        self.inner.points(first, count, receivers, upcoming)
     }
 }
 

@@ -83,6 +83,11 @@ impl DataFile {
         })
     }
 
+    /// Has the operating system begin to read what will be read soon; returns at once.
+    pub fn will_need(&self, offset: u64, bytes: u64) {
+        self.storage.will_need(offset, bytes);
+    }
+
     /// Writes all of `data` at `offset`.
     ///
     /// # Errors

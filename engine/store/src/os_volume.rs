@@ -2,7 +2,7 @@
 
 use crate::limits::FILE_MODE;
 use crate::volume::{Entry, EntryKind, Lock, RenameMode, Storage, Volume};
-use nix::fcntl::{AT_FDCWD, OFlag, RenameFlags, renameat2};
+use nix::fcntl::{AT_FDCWD, OFlag, PosixFadviseAdvice, RenameFlags, posix_fadvise, renameat2};
 use std::fs::{self, DirBuilder, File, FileType, OpenOptions, TryLockError};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt};
@@ -22,6 +22,16 @@ impl Storage for OsFile {
 
     fn read_at(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
         self.0.read_exact_at(out, offset)
+    }
+
+    fn will_need(&self, offset: u64, bytes: u64) {
+        // A hint: a file system that knows none reads later.
+        let _ = posix_fadvise(
+            &self.0,
+            offset as i64,
+            bytes as i64,
+            PosixFadviseAdvice::POSIX_FADV_WILLNEED,
+        );
     }
 
     fn write_at(&self, offset: u64, data: &[u8]) -> io::Result<()> {

@@ -62,6 +62,15 @@ impl PageFile {
         self.checksums.len() as u64
     }
 
+    /// Has the operating system begin to read a page that will be read soon; returns at once.
+    pub fn will_need(&self, page: PageNo) {
+        let layout = &self.header.layout;
+        if u64::from(page.0) < self.page_count() {
+            let offset = layout.page_offset(u64::from(page.0));
+            self.file.will_need(offset, layout.page_bytes() as u64);
+        }
+    }
+
     /// Reads a page and checks its sum; `out` is exactly one page long.
     ///
     /// # Errors

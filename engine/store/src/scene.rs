@@ -103,6 +103,14 @@ impl Scene {
         }
     }
 
+    /// Has the operating system begin to read a page that will be read soon; returns at once.
+    pub fn will_need(&self, kind: PageKind, page: PageNo) {
+        match kind {
+            PageKind::Node => self.nodes.will_need(page),
+            PageKind::Point => self.points.will_need(page),
+        }
+    }
+
     /// Reads every page once and checks its sum.
     ///
     /// # Errors

@@ -23,6 +23,11 @@ pub trait Storage: Send + Sync {
     /// [`io::ErrorKind::UnexpectedEof`] if the file ends before `out` is full.
     fn read_at(&self, offset: u64, out: &mut [u8]) -> io::Result<()>;
 
+    /// Begins to read what will be read soon, if it can; returns at once.
+    fn will_need(&self, offset: u64, bytes: u64) {
+        let _ = (offset, bytes);
+    }
+
     /// Writes all of `data` at `offset`; the file grows where needed.
     ///
     /// # Errors

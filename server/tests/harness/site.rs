@@ -4,7 +4,7 @@
 
 use super::{Daemon, PATIENCE, script};
 use hyper_util::rt::TokioIo;
-use pbgi_cache::channel::{self, PageOutcome, PageReply, PageRequest, Welcome};
+use pbgi_cache::channel::{self, PageOutcome, PageRequest, Welcome};
 use pbgi_cache::{CacheView, LocalCache};
 use pbgi_core::point::Sides;
 use pbgi_core::{MountId, PageKey, PageKind, PageNo, PointRecord};
@@ -163,13 +163,8 @@ fn fetch(socket: &UnixStream, cache: &mut LocalCache, task: &v1::Task, lease: &v
     for key in &missing {
         cache.reserve(key.kind, 1);
     }
-    let request = PageRequest {
-        id: 1,
-        job: lease.task_id,
-        keys: missing.clone(),
-    };
-    channel::send(socket, &request).unwrap();
-    let reply: PageReply = channel::receive(socket).unwrap().unwrap();
+    let request = PageRequest::new(1, lease.task_id, missing.clone());
+    let reply = channel::ask(socket, &request).unwrap().unwrap();
     for (key, outcome) in missing.iter().zip(&reply.outcomes) {
         let PageOutcome::Pinned(fetched) = outcome else {
             panic!("{}", reply.error)

@@ -65,16 +65,19 @@ fn with_channel<T>(owner: &CacheOwner, scene: &Scene, work: impl FnOnce(UnixStre
     std::thread::scope(|scope| {
         scope.spawn(move || {
             let seat = owner.seat(0).unwrap();
-            while let Some(request) = channel::receive::<PageRequest>(&ours).unwrap() {
+            let answer = |request: &PageRequest| {
                 let fetch = |&key: &PageKey| {
                     owner.fetch(seat, key, request.job, |page| {
                         scene.read_page(key.kind, key.page, page).unwrap();
                         Ok(())
                     })
                 };
-                let reply = PageReply::new(request.id, request.keys.iter().map(fetch));
-                channel::send(&ours, &reply).unwrap();
-            }
+                for key in request.keys.iter().skip(1) {
+                    scene.will_need(key.kind, key.page);
+                }
+                PageReply::new(request.id, request.keys.iter().map(fetch))
+            };
+            channel::serve(&ours, answer).unwrap();
         });
         work(theirs)
     })
@@ -143,10 +146,10 @@ fn misses(scene: &Scene) {
             let mut source = PageSource::new(&mut cache, &mut view, 1);
             nanos(pages, |page| match kind {
                 PageKind::Node => {
-                    black_box(source.node(NodeIndex(page * per_page), 1).unwrap());
+                    black_box(source.node(NodeIndex(page * per_page), 1, &()).unwrap());
                 }
                 PageKind::Point => {
-                    black_box(source.points(PointIndex(page * per_page), 1, 1).unwrap());
+                    black_box(source.points(PointIndex(page * per_page), 1, 1, &()).unwrap());
                 }
             })
         });
@@ -176,9 +179,8 @@ fn batches(owner: &CacheOwner, scene: &Scene, kind: PageKind, pages: u32) -> f64
             let keys: Vec<PageKey> = (0..TOGETHER).map(|page| key(kind, batch * TOGETHER + page)).collect();
             cache.reserve(kind, keys.len());
             let id = u64::from(batch);
-            let request = PageRequest { id, job: 1, keys };
-            channel::send(&theirs, &request).unwrap();
-            let reply: PageReply = channel::receive(&theirs).unwrap().unwrap();
+            let request = PageRequest::new(id, 1, keys);
+            let reply = channel::ask(&theirs, &request).unwrap().unwrap();
             for (&key, outcome) in request.keys.iter().zip(&reply.outcomes) {
                 let channel::PageOutcome::Pinned(fetched) = outcome else {
                     panic!("{}", reply.error)

@@ -20,7 +20,7 @@ fn frame(house: &House, memory: u64) -> Option<serde_json::Value> {
     house.shutdown();
     if run.code != Some(0) {
         println!(
-            "  {:8.0} MiB  {}",
+            "| {:.0} MiB | {} |",
             mib(memory),
             run.stderr.lines().last().unwrap_or_default()
         );
@@ -30,48 +30,48 @@ fn frame(house: &House, memory: u64) -> Option<serde_json::Value> {
     let row = |name: &str| statistics[name].as_f64().unwrap_or(0.0);
     let served = row("average_traversal_bytes") * row("shading_calls");
     println!(
-        "  {:8.0} MiB {:9.1} s {:8.2} % {:11.4} % {:11.5} % {:9.1} MiB {:9} {:9} {:9.2} {:5}",
+        "| {:.0} | {:.0} MiB | {:.1} | {:.1} s | {:.2} % | {:.3} % | {:.4} % | {:.0} MiB | {} | {} | {} |",
+        (memory as f64 - PRIVATE_BYTES) * SEGMENT_SHARE / row("average_traversal_bytes"),
         mib(memory),
+        row("out_of_core_bytes") / memory as f64,
         row("shading_seconds"),
         row("shading_io_seconds") * 100.0 / (row("shading_seconds") * f64::from(WORKERS)),
         (1.0 - row("bytes_read") / served) * 100.0,
         row("cache_hit_ratio") * 100.0,
-        row("peak_memory_bytes") / f64::from(1 << 20),
+        mib(row("peak_memory_bytes") as u64),
         row("pages_loaded"),
         row("reloads"),
-        row("out_of_core_bytes") / memory as f64,
         row("redundant_reads"),
     );
     Some(statistics)
 }
 
-/// Prints the table.
+/// Prints the tables.
 pub(crate) fn print(options: &Options) {
     let house = House::new();
     build_town(options.points, &house.path(""), "town.pbgi");
     let (width, height) = options.size;
-    Town::new(options.points)
-        .gbuffer(width, height)
-        .write(&house.path("g.exr"))
-        .unwrap();
-    println!("out of core, {WORKERS} workers, {width} x {height} receivers spread over the whole town");
-    println!(
-        "    memory       shading  waiting  hits/receiver  hits/look-up       peak     loads   reloads  size/cap  redundant"
-    );
+    head(&house, options.points, (width, height));
     let Some(statistics) = frame(&house, options.memory) else {
         return;
     };
+    // A quarter of the picture, so that it has room in the smallest of budgets.
+    head(&house, options.points, (width / 2, height / 2));
     let traversal = statistics["average_traversal_bytes"].as_f64().unwrap_or(0.0);
-    println!(
-        "  the cache as multiples of the {:.2} MiB that a receiver touches:",
-        traversal / f64::from(1 << 20)
-    );
     for times in CURVE {
-        print!("  {times:3} x");
-        frame(
-            &house,
-            (PRIVATE_BYTES + f64::from(times) * traversal / SEGMENT_SHARE) as u64,
-        );
+        let pages = f64::from(times) * traversal;
+        frame(&house, (PRIVATE_BYTES + pages / SEGMENT_SHARE) as u64);
     }
     println!();
+}
+
+/// Makes the receivers, and prints the head of their table.
+fn head(house: &House, points: u64, (width, height): (u32, u32)) {
+    let receivers = Town::new(points).gbuffer(width, height);
+    receivers.write(&house.path("g.exr")).unwrap();
+    println!(
+        "out of core, {WORKERS} workers, {width} x {height} receivers spread over the whole town\n\n\
+         | Pages over a traversal | memory | scene over memory | shading | waiting | hits a receiver | hits a look-up \
+         | peak | loads | reloads | redundant |\n|---|---|---|---|---|---|---|---|---|---|---|"
+    );
 }

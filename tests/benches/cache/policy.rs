@@ -8,7 +8,7 @@ use pbgi_core::{
     BuildSettings, MountId, NodeIndex, NodeRecord, PageKey, PageKind, PageNo, PointIndex, PointRecord, SceneInfo,
     ShadeSettings,
 };
-use pbgi_shade::{ArraySource, Receiver, SceneSource, Shaded, Shader, SourceError};
+use pbgi_shade::{ArraySource, Receiver, SceneSource, Shaded, Shader, SourceError, Upcoming};
 use pbgi_store::Scene;
 use std::collections::{BTreeMap, HashMap};
 
@@ -49,15 +49,21 @@ impl Recorder {
 }
 
 impl SceneSource for Recorder {
-    fn node(&mut self, index: NodeIndex, receivers: u8) -> Result<&NodeRecord, SourceError> {
+    fn node(&mut self, index: NodeIndex, receivers: u8, upcoming: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
         self.note(PageKind::Node, index.0);
-        self.arrays.node(index, receivers)
+        self.arrays.node(index, receivers, upcoming)
     }
 
-    fn points(&mut self, first: PointIndex, count: u32, receivers: u8) -> Result<&[PointRecord], SourceError> {
+    fn points(
+        &mut self,
+        first: PointIndex,
+        count: u32,
+        receivers: u8,
+        upcoming: &impl Upcoming,
+    ) -> Result<&[PointRecord], SourceError> {
         self.note(PageKind::Point, first.0);
         self.note(PageKind::Point, first.0 + count - 1);
-        self.arrays.points(first, count, receivers)
+        self.arrays.points(first, count, receivers, upcoming)
     }
 
     fn begin_pack(&mut self) {
