@@ -53,7 +53,7 @@ fn fill(page: &mut [u8], key: PageKey) -> Result<(), LoadError> {
         PageKind::Point => POINT_BYTES,
     };
     // As slow as a disk, so that the worker asks ahead.
-    std::thread::sleep(Duration::from_millis(2));
+    std::thread::sleep(Duration::from_micros(300));
     page.fill(0);
     for (slot, record) in page.chunks_exact_mut(record_bytes).enumerate() {
         let index = (key.page.0 * RECORDS_PER_PAGE) as f32 + slot as f32;

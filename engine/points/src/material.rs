@@ -11,6 +11,8 @@ pub(crate) struct Material {
     /// Opacity factor.
     pub(crate) alpha: f32,
     pub(crate) albedo_texture: Option<TextureSlot>,
+    /// Opacity is the alpha of this one; without it, of the albedo's.
+    pub(crate) opacity_texture: Option<TextureSlot>,
     /// Emitted radiance factor, W/(m2 sr).
     pub(crate) emission: [f32; 3],
     pub(crate) emission_texture: Option<TextureSlot>,
@@ -26,6 +28,7 @@ impl Default for Material {
             albedo: [1.0; 3],
             alpha: 1.0,
             albedo_texture: None,
+            opacity_texture: None,
             emission: [0.0; 3],
             emission_texture: None,
             cutoff: None,
@@ -93,6 +96,16 @@ impl Texture {
                 f32::from(a) / 255.0,
             ]
         })
+    }
+
+    /// A picture of opacity: that of a picture without an alpha channel is how bright it is.
+    pub(crate) fn into_opacity(mut self) -> Self {
+        if self.texels.iter().all(|texel| texel[3] == u8::MAX) {
+            for texel in &mut self.texels {
+                texel[3] = texel[0];
+            }
+        }
+        self
     }
 
     /// Opacity at `uv`, bilinear.

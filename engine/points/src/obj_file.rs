@@ -1,5 +1,5 @@
-//! Wavefront OBJ: faces, `Kd` and `map_Kd`, `Ke` and `map_Ke`, dissolve (`d`, or 1 - `Tr`) below one half as a hole. No lights and
-//! no cameras.
+//! Wavefront OBJ: faces, `Kd` and `map_Kd`, `Ke` and `map_Ke`, dissolve (`d`, or 1 - `Tr`, and `map_d`) below one half as a
+//! hole. No lights and no cameras.
 
 use crate::error::PointsError;
 use crate::material::{Material, Texture, TextureSlot, Wrap};
@@ -89,11 +89,12 @@ fn read_material(
     path: &Path,
     material: &tobj::Material,
     textures: &mut Vec<Texture>,
-    known: &mut BTreeMap<String, usize>,
+    known: &mut BTreeMap<(String, Use), usize>,
 ) -> Result<Material, PointsError> {
-    let mut slot = |map: Option<&String>| map.map(|map| slot(path, map, textures, known)).transpose();
-    let albedo_texture = slot(material.diffuse_texture.as_ref())?;
-    let emission_texture = slot(material.unknown_param.get("map_Ke"))?;
+    let mut slot = |map: Option<&String>, purpose| map.map(|map| slot(path, map, purpose, textures, known)).transpose();
+    let albedo_texture = slot(material.diffuse_texture.as_ref(), Use::Color)?;
+    let opacity_texture = slot(material.dissolve_texture.as_ref(), Use::Opacity)?;
+    let emission_texture = slot(material.unknown_param.get("map_Ke"), Use::Color)?;
     let diffuse = material.diffuse.unwrap_or(GREY);
     let emission = match material.emissive {
         None if emission_texture.is_some() => [1.0; 3],
@@ -120,6 +121,7 @@ fn read_material(
         },
         alpha: material.dissolve.unwrap_or(1.0 - see_through.unwrap_or(0.0)),
         albedo_texture,
+        opacity_texture,
         emission,
         emission_texture,
         cutoff: Some(0.5),
@@ -183,11 +185,19 @@ fn split_word(text: &str) -> Option<(&str, &str)> {
         .map(|(word, rest)| (word, rest.trim()))
 }
 
+/// What a picture is read for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Use {
+    Color,
+    Opacity,
+}
+
 fn slot(
     path: &Path,
     text: &str,
+    purpose: Use,
     textures: &mut Vec<Texture>,
-    known: &mut BTreeMap<String, usize>,
+    known: &mut BTreeMap<(String, Use), usize>,
 ) -> Result<TextureSlot, PointsError> {
     let map = Map::parse(text).filter(|map| map.scale.is_finite() && map.offset.is_finite());
     let map = map.ok_or_else(|| PointsError::invalid(path, format!("a material's map is not understood: {text:?}")))?;
@@ -195,7 +205,7 @@ fn slot(
     let offset = Vec2::new(map.offset.x, 1.0 - map.scale.y - map.offset.y);
     let moved = map.scale != Vec2::ONE || map.offset != Vec2::ZERO;
     Ok(TextureSlot {
-        texture: texture(path, map.name, textures, known)?,
+        texture: texture(path, map.name, purpose, textures, known)?,
         uv_set: 0,
         transform: moved.then(|| Affine2::from_translation(offset) * Affine2::from_scale(map.scale)),
         wrap: [if map.clamped { Wrap::Clamp } else { Wrap::Repeat }; 2],
@@ -205,10 +215,11 @@ fn slot(
 fn texture(
     path: &Path,
     name: &str,
+    purpose: Use,
     textures: &mut Vec<Texture>,
-    known: &mut BTreeMap<String, usize>,
+    known: &mut BTreeMap<(String, Use), usize>,
 ) -> Result<usize, PointsError> {
-    if let Some(&index) = known.get(name) {
+    if let Some(&index) = known.get(&(name.to_owned(), purpose)) {
         return Ok(index);
     }
     // Windows' separators.
@@ -217,8 +228,12 @@ fn texture(
         let what = format!("texture {file:?} is named but cannot be read ({error}): copy it beside the scene");
         PointsError::invalid(path, what)
     })?;
-    textures.push(decode(&file, &bytes)?);
-    known.insert(name.to_owned(), textures.len() - 1);
+    let picture = decode(&file, &bytes)?;
+    textures.push(match purpose {
+        Use::Color => picture,
+        Use::Opacity => picture.into_opacity(),
+    });
+    known.insert((name.to_owned(), purpose), textures.len() - 1);
     Ok(textures.len() - 1)
 }
 

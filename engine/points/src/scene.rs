@@ -234,7 +234,8 @@ impl MeshScene {
         let Some(cutoff) = material.cutoff else {
             return true;
         };
-        let textured = material.albedo_texture.as_ref().map_or(1.0, |slot| {
+        let texture = material.opacity_texture.as_ref().or(material.albedo_texture.as_ref());
+        let textured = texture.map_or(1.0, |slot| {
             let uv = geometry.uv(slot.uv_set, triangle, barycentric);
             self.textures[slot.texture].alpha(slot, uv)
         });

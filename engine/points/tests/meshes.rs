@@ -248,6 +248,28 @@ fn wavefront_files_have_their_colours_and_holes() {
 }
 
 #[test]
+fn a_wavefront_opacity_map_cuts_holes_by_its_brightness_or_its_alpha() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.obj");
+    let text = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n\
+        usemtl leaf\nf 1/1 2/2 3/3 4/4\n";
+    fs::write(&path, text).unwrap();
+    fs::write(folder.path().join("a.mtl"), "newmtl leaf\nKd 1 1 1\nmap_d -clamp on mask.png\n").unwrap();
+    let mask = folder.path().join("mask.png");
+    // White on the left; then the same in the alpha of a picture that is bright all over.
+    let bright = image::GrayImage::from_fn(8, 1, |x, _| image::Luma([if x < 4 { 255 } else { 0 }]));
+    let alpha = image::RgbaImage::from_fn(8, 1, |x, _| image::Rgba([255, 255, 255, if x < 4 { 255 } else { 0 }]));
+    bright.save(&mask).unwrap();
+    let by_brightness = sample(MeshScene::load(&path).unwrap(), Density::Points(1000));
+    alpha.save(&mask).unwrap();
+    let by_alpha = sample(MeshScene::load(&path).unwrap(), Density::Points(1000));
+    for points in [by_brightness, by_alpha] {
+        assert!(points.len() > 400, "{}", points.len());
+        assert!(points.iter().all(|point| point.position[0] < 0.51));
+    }
+}
+
+#[test]
 fn what_is_missing_or_broken_is_named() {
     let load = |path: &Path| MeshScene::load(path);
     assert_says(load(Path::new("nowhere.glb")), &["cannot read", "nowhere.glb"]);

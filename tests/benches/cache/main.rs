@@ -1,7 +1,7 @@
 //! The page cache in figures: what a look-up costs, how well pages are chosen, what shading out of core costs.
 //!
 //!     cargo bench -p pbgi-tests --bench cache
-//!     cargo bench -p pbgi-tests --bench cache -- out-of-core --points 125M --memory 2G --size 1536x1024
+//!     cargo bench -p pbgi-tests --bench cache -- out-of-core --points 160M --memory 2G --size 1536x1024
 //!
 //! Sections: `costs`, `policy`, `in-core`, `out-of-core`; without a name all of them, on a small scene. Pages are held by the
 //! operating system unless the scene is larger than the machine's memory.

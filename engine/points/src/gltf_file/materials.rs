@@ -68,6 +68,7 @@ impl Loader<'_> {
             albedo: [r, g, b],
             alpha,
             albedo_texture: self.slot(surface.base_color_texture())?,
+            opacity_texture: None,
             emission,
             emission_texture: self.slot(material.emissive_texture())?,
             cutoff,

@@ -136,6 +136,7 @@ impl Materials {
                 albedo: surface.albedo,
                 alpha: surface.alpha,
                 albedo_texture: slot(&surface.albedo_map),
+                opacity_texture: None,
                 emission: surface.emission,
                 emission_texture: slot(&surface.emission_map),
                 cutoff: surface.cutoff,
