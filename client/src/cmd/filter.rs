@@ -139,6 +139,11 @@ pub(crate) async fn filter(args: FilterArgs, interrupt: &Interrupt) -> Result<()
     let sort_seconds = started.elapsed().as_secs_f64();
     let count = ordered.receivers.count();
     let mut values = BakedValues::create(&plan.reading.scratch_dir, count)?;
+    // The first values come when the scenes of further bounces are made.
+    progress.stage(match plan.job.settings.bounces {
+        ..=1 => "shading",
+        _ => "bouncing the light",
+    });
     let (mut statistics, skipped) = {
         let (blocks, receivers) = mpsc::channel(BLOCKS_AHEAD);
         let (places, mut shaded_places) = std::sync::mpsc::channel();

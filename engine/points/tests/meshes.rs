@@ -254,7 +254,11 @@ fn a_wavefront_opacity_map_cuts_holes_by_its_brightness_or_its_alpha() {
     let text = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n\
         usemtl leaf\nf 1/1 2/2 3/3 4/4\n";
     fs::write(&path, text).unwrap();
-    fs::write(folder.path().join("a.mtl"), "newmtl leaf\nKd 1 1 1\nmap_d -clamp on mask.png\n").unwrap();
+    fs::write(
+        folder.path().join("a.mtl"),
+        "newmtl leaf\nKd 1 1 1\nmap_d -clamp on mask.png\n",
+    )
+    .unwrap();
     let mask = folder.path().join("mask.png");
     // White on the left; then the same in the alpha of a picture that is bright all over.
     let bright = image::GrayImage::from_fn(8, 1, |x, _| image::Luma([if x < 4 { 255 } else { 0 }]));
