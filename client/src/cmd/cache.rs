@@ -26,15 +26,7 @@ pub(crate) struct CacheArgs {
 }
 
 pub(crate) async fn cache(args: CacheArgs, interrupt: &Interrupt) -> Result<(), Failure> {
-    let answers = interrupt.guard(async {
-        let mut answers = Vec::new();
-        for client in session::running(&args.running).await? {
-            let status = client.cache().await?;
-            answers.push((client, status));
-        }
-        Ok(answers)
-    });
-    let answers = answers.await?;
+    let answers = session::ask_running(&args.running, interrupt, async |client| client.cache().await).await?;
     if args.form.json {
         return say(&at_address(&answers));
     }

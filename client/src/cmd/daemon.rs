@@ -122,15 +122,7 @@ pub(crate) struct StatusArgs {
 }
 
 pub(crate) async fn status(args: StatusArgs, interrupt: &Interrupt) -> Result<(), Failure> {
-    let answers = interrupt.guard(async {
-        let mut answers = Vec::new();
-        for client in session::running(&args.running).await? {
-            let status = client.status().await?;
-            answers.push((client, status));
-        }
-        Ok(answers)
-    });
-    let answers = answers.await?;
+    let answers = session::ask_running(&args.running, interrupt, async |client| client.status().await).await?;
     if args.form.json {
         return say(&at_address(&answers));
     }

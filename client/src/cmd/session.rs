@@ -71,6 +71,23 @@ pub(crate) async fn running(args: &RunningArgs) -> Result<Vec<Client>, Failure> 
     Ok(clients)
 }
 
+/// What each daemon that runs answers.
+pub(crate) async fn ask_running<T>(
+    args: &RunningArgs,
+    interrupt: &Interrupt,
+    question: impl AsyncFn(&Client) -> Result<T, ClientError>,
+) -> Result<Vec<(Client, T)>, Failure> {
+    let answers = async {
+        let mut answers = Vec::new();
+        for client in running(args).await? {
+            let answer = question(&client).await?;
+            answers.push((client, answer));
+        }
+        Ok(answers)
+    };
+    interrupt.guard(answers).await
+}
+
 /// The daemon that knows a job, and the job.
 pub(crate) async fn find_job(args: &RunningArgs, id: &str) -> Result<(Client, Job), Failure> {
     for client in running(args).await? {
