@@ -7,6 +7,7 @@ use crate::sh::SH_TERMS;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use half::f16;
+use std::sync::LazyLock;
 
 /// One octree node with its cluster.
 ///
@@ -95,6 +96,13 @@ const OVERFLOW_BIT: u8 = 0x40;
 /// Radius codes are eighths of an octave around 2^-16 .. 2^16.
 const RADIUS_STEPS: f32 = 8.0;
 const RADIUS_ONE: f32 = 128.0;
+/// By code; looked up, because every node that is looked at asks.
+static RADIUS_RATIOS: LazyLock<[f32; 256]> = LazyLock::new(|| {
+    std::array::from_fn(|code| match code {
+        0 => 0.0,
+        code => ((code as f32 - RADIUS_ONE) / RADIUS_STEPS).exp2(),
+    })
+});
 const FILL_STEPS: f32 = 64.0;
 /// Of shares from 0 to 1.
 const SHARE_STEPS: f32 = 255.0;
@@ -172,11 +180,7 @@ impl NodeRecord {
     /// Upper bound of the largest point radius over the voxel's edge: how far discs may stick out of the voxel.
     #[inline]
     pub fn radius_ratio(&self) -> f32 {
-        if self.radius_code == 0 {
-            0.0
-        } else {
-            ((f32::from(self.radius_code) - RADIUS_ONE) / RADIUS_STEPS).exp2()
-        }
+        RADIUS_RATIOS[usize::from(self.radius_code)]
     }
 
     /// Root mean square of the sine between the discs' normals and the axis: 0 for a flat cluster, 0.8 for a round one.

@@ -1,10 +1,10 @@
 //! A node as receivers see it: whether it may stand for what is below it, and where its surface lies.
 
 use crate::leaf::along_faces;
-use crate::simd::{Floats, Words};
+use crate::simd::{Floats, LANES, Words};
 use crate::vector::Vector;
 use glam::{Vec2, Vec3};
-use half::slice::HalfFloatSliceExt;
+use half::f16;
 use pbgi_core::cluster::separate_sides;
 use pbgi_core::pack::area_normaliser;
 use pbgi_core::sh::{BASIS_FACTORS, SH_TERMS, basis};
@@ -78,13 +78,9 @@ pub(crate) struct Cluster<'a> {
 
 impl<'a> Cluster<'a> {
     #[inline(always)]
-    pub(crate) fn new(node: &'a NodeRecord, edge: f32) -> Self {
+    pub(crate) fn new<F: Floats>(node: &'a NodeRecord, edge: f32) -> Self {
         let axis = node.axis();
-        let mut covariance = [0.0; 6];
-        node.covariance.as_slice().convert_to_f32_slice(&mut covariance);
-        for value in &mut covariance {
-            *value *= edge * edge;
-        }
+        let covariance = to_floats::<F, 6>(&node.covariance).map(|value| value * (edge * edge));
         let normaliser = area_normaliser(edge);
         let across = quadratic_form(&covariance, axis).max(0.0).sqrt();
         let (fill, spread) = (node.fill(), node.spread());
@@ -163,17 +159,15 @@ impl<'a> Cluster<'a> {
         (along.max(F::splat(0.0)) * F::splat(3.0)).sqrt()
     }
 
-    fn terms(&self) -> [f32; 4 * SH_TERMS] {
-        let mut terms = [0.0f32; 4 * SH_TERMS];
-        let halves: &[half::f16] = bytemuck::cast_slice(&self.node.sh);
-        halves.convert_to_f32_slice(&mut terms);
-        terms
+    #[inline(always)]
+    fn terms<F: Floats>(&self) -> [f32; 4 * SH_TERMS] {
+        to_floats::<F, { 4 * SH_TERMS }>(bytemuck::cast_ref(&self.node.sh))
     }
 
     /// Power of a flat cluster's two sides: radiance times area, the side of the axis first.
-    #[inline(never)]
-    pub(crate) fn side_powers(&self) -> [Vec3; 2] {
-        let terms = self.terms();
+    #[inline(always)]
+    pub(crate) fn side_powers<F: Floats>(&self) -> [Vec3; 2] {
+        let terms = self.terms::<F>();
         let y = basis(self.axis);
         // Even and odd bands apart: their sum looks along the axis, their difference against it.
         let (mut even, mut odd) = (Vec3::ZERO, Vec3::ZERO);
@@ -200,7 +194,7 @@ impl<'a> Cluster<'a> {
     /// Projected area of the sides of all discs that count, and power, toward unit directions.
     #[inline(always)]
     pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>, sides: HitSides) -> (F, Vector<F>) {
-        let terms = self.terms();
+        let terms = self.terms::<F>();
         let y = basis_of(direction);
         let (zero, scale) = (F::splat(0.0), F::splat(self.normaliser));
         let [even, odd] = bands(&terms, &y, 0);
@@ -275,6 +269,17 @@ pub(crate) fn is_own_surface<F: Floats>(
         F::splat(SAME_SURFACE).less(facing.abs()) & chord.less(F::splat(ARC_SLACK) * center.length_squared().sqrt());
     let in_depth = F::splat(SAME_SHEET).less(facing) & behind.less(F::splat(SHEET_DEPTH * size));
     !behind.less(F::splat(0.0)) & (on_arc | in_depth)
+}
+
+#[inline(always)]
+fn to_floats<F: Floats, const N: usize>(halves: &[f16; N]) -> [f32; N] {
+    let mut floats = [0.0; N];
+    for (floats, halves) in floats.chunks_mut(LANES).zip(halves.chunks(LANES)) {
+        let mut eight = [f16::ZERO; LANES];
+        eight[..halves.len()].copy_from_slice(halves);
+        floats.copy_from_slice(&F::from_halves(eight).to_array()[..halves.len()]);
+    }
+    floats
 }
 
 #[inline(always)]

@@ -6,11 +6,11 @@
 
 use crate::cluster::Cluster;
 use crate::frame::Frame;
-use crate::leaf::{Cube, Part, take_apart};
+use crate::leaf::{Cube, Leaves, Part};
 use crate::painter::Painter;
 use crate::raster::{Raster, RasterTables};
 use crate::shader::{Receiver, ShadeCounters, ShadeError};
-use crate::simd::{Floats, LANES, Words};
+use crate::simd::{Floats, LANES, ScalarFloats, Words};
 use crate::source::{SceneSource, SourceError, Upcoming, Wanted};
 use crate::vector::{Frames, Vector};
 use glam::{DVec3, Vec3};
@@ -84,7 +84,7 @@ impl Visit {
 pub(crate) struct Scratch {
     stack: Vec<Visit>,
     points: Vec<PointRecord>,
-    parts: Vec<Part>,
+    leaves: Leaves,
     order: Vec<(f32, u32)>,
 }
 
@@ -145,7 +145,7 @@ impl Upcoming for Pending<'_> {
                 want(Wanted::Node(visit.index))?;
                 continue;
             };
-            let cluster = Cluster::new(node, 2.0 * visit.half);
+            let cluster = Cluster::new::<ScalarFloats>(node, 2.0 * visit.half);
             let (from, _) = cluster.accepted_from_squared(self.walk.settings.max_solid_angle);
             let distance = (cluster.centroid - self.leader.position).length_squared();
             let whole = matches!(node.kind(), NodeKind::Leaf { .. }) && cluster.fills_section();
@@ -171,7 +171,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
     let Scratch {
         stack,
         points,
-        parts,
+        leaves,
         order,
     } = scratch;
     stack.clear();
@@ -210,7 +210,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
         let node = source.node(visit.index, lanes, &pending)?;
         check(node, &visit, walk.info.settings.leaf_max)?;
         let radius = visit.radius.min(node.radius_ratio() * 2.0 * visit.half);
-        let cluster = Cluster::new(node, 2.0 * visit.half);
+        let cluster = Cluster::new::<F>(node, 2.0 * visit.half);
         let centroid = pack.relative(cluster.centroid);
         let kind = node.kind();
         let whole = match kind {
@@ -240,6 +240,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
         if opened == 0 {
             continue;
         }
+        let mut parts: &[Part] = &[];
         if let NodeKind::Leaf { first, count } = kind {
             counters.cut_elements += u64::from(count) * u64::from(opened.count_ones());
             read_points(source, first, count, opened, &pending, points)?;
@@ -247,7 +248,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
                 center: (middle + visit.offset.as_dvec3()).as_vec3(),
                 half: visit.half,
             };
-            take_apart(points, voxel, parts);
+            parts = leaves.parts((visit.index, visit.path), points, voxel);
         }
         // The octant of the voxel that is nearest to a receiver.
         let zero = F::splat(0.0);

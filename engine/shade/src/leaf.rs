@@ -2,11 +2,10 @@
 //! surface), as those planes' pieces of the voxel, each cut by the others, so that walls meet in a line instead of a fringe
 //! of discs. Nothing here depends on a receiver.
 
-use glam::{DVec3, Vec3};
-use pbgi_core::PointRecord;
-use pbgi_core::section::{HalfSpace, section_area, voxel_half_spaces};
-
 use crate::cluster::SECTION_FILL;
+use glam::{DVec3, Vec3};
+use pbgi_core::section::{HalfSpace, section_area, voxel_half_spaces};
+use pbgi_core::{NodeIndex, PointRecord};
 
 /// Planes a leaf is taken apart into; with more it is no edge or corner.
 const FACETS_MAX: usize = 3;
@@ -27,6 +26,9 @@ const POINT_REACH: f32 = 2.0;
 const FACET_FILL: f32 = 0.35;
 /// Membership is kept in one word.
 const POINTS_MAX: usize = 64;
+
+/// Leaves that are kept taken apart.
+const KEPT: usize = 128;
 
 /// A voxel of the world.
 #[derive(Clone, Copy, Debug)]
@@ -121,8 +123,37 @@ struct Plane {
     members: u64,
 }
 
+/// The leaves that were taken apart lately, by what names them: neighbouring receivers open the same ones.
+pub(crate) struct Leaves {
+    slots: Vec<(Option<LeafName>, Vec<Part>)>,
+}
+
+/// Where a leaf lies in its file, and the path to its voxel, which only a forged file has twice.
+type LeafName = (NodeIndex, u64);
+
+impl Default for Leaves {
+    fn default() -> Self {
+        Self {
+            slots: vec![(None, Vec::new()); KEPT],
+        }
+    }
+}
+
+impl Leaves {
+    /// The parts of a leaf with these points.
+    pub(crate) fn parts(&mut self, name: LeafName, points: &[PointRecord], voxel: Cube) -> &[Part] {
+        // Neighbours in the file get neighbouring slots.
+        let (kept, parts) = &mut self.slots[name.0.0 as usize % KEPT];
+        if *kept != Some(name) {
+            take_apart(points, voxel, parts);
+            *kept = Some(name);
+        }
+        parts
+    }
+}
+
 /// Takes a leaf apart.
-pub(crate) fn take_apart(points: &[PointRecord], voxel: Cube, parts: &mut Vec<Part>) {
+fn take_apart(points: &[PointRecord], voxel: Cube, parts: &mut Vec<Part>) {
     parts.clear();
     let discs = |members: u64| {
         let inside = move |(index, _): &(usize, &PointRecord)| members >> (index % POINTS_MAX) & 1 == 1;

@@ -131,7 +131,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         );
         let covered = self.cover(&footprint, lanes, None, weight, visit.path);
         if let Some(covered) = covered {
-            let powers = cluster.side_powers();
+            let powers = cluster.side_powers::<F>();
             // One sheet shows all its area; of two the receiver sees the nearer.
             let area = if cluster.fill > TWO_SHEETS_FILL {
                 drawn_area

@@ -7,6 +7,7 @@
 use crate::footprint::Footprint;
 use crate::raster::{Covered, Ink, Raster, RasterTables};
 use crate::vector::Vector;
+use half::f16;
 use std::fmt::Debug;
 use std::ops::{Add, BitAnd, BitOr, BitXor, Div, Mul, Neg, Not, Sub};
 
@@ -21,6 +22,7 @@ pub(crate) trait Floats:
     type Words: Words<Floats = Self>;
 
     fn from_array(values: [f32; LANES]) -> Self;
+    fn from_halves(halves: [f16; LANES]) -> Self;
     fn to_array(self) -> [f32; LANES];
     fn sqrt(self) -> Self;
     /// `self * factor + term`, rounded once.
@@ -215,6 +217,11 @@ impl Floats for ScalarFloats {
     #[inline(always)]
     fn from_array(values: [f32; LANES]) -> Self {
         Self(values)
+    }
+
+    #[inline(always)]
+    fn from_halves(halves: [f16; LANES]) -> Self {
+        Self(halves.map(f16::to_f32))
     }
 
     #[inline(always)]
@@ -466,6 +473,12 @@ mod avx2 {
         fn from_array(values: [f32; LANES]) -> Self {
             // SAFETY: both are 32 bytes that may hold anything.
             Self(unsafe { transmute::<[f32; LANES], __m256>(values) })
+        }
+
+        #[inline(always)]
+        fn from_halves(halves: [f16; LANES]) -> Self {
+            // SAFETY: both are 16 bytes that may hold anything; the instruction as for the operators.
+            Self(unsafe { _mm256_cvtph_ps(transmute::<[f16; LANES], __m128i>(halves)) })
         }
 
         #[inline(always)]
