@@ -1,6 +1,7 @@
-//! What commands answer, on standard output.
+//! What commands answer, on standard output, and what they say beside that, on standard error.
 
 use super::failure::Failure;
+use std::fmt::Arguments;
 use std::io::{self, Write};
 
 /// Prints a text that ends a line. A reader who has seen enough and gone, as `head` does, is no failure.
@@ -18,4 +19,9 @@ pub(crate) fn say(text: &str) -> Result<(), Failure> {
         }
         _ => Ok(()),
     }
+}
+
+/// Says a line on standard error, to whoever reads that; nobody has to.
+pub(crate) fn note(line: Arguments<'_>) {
+    let _ = writeln!(io::stderr().lock(), "{line}");
 }

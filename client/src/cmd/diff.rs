@@ -1,6 +1,6 @@
 //! `diff`: how far two pictures are apart.
 
-use super::answer::say;
+use super::answer::{note, say};
 use super::failure::Failure;
 use super::files::{self, Existing};
 use super::interrupt::Interrupt;
@@ -113,7 +113,10 @@ fn run(args: &DiffArgs) -> Result<bool, Failure> {
         let window = difference.window;
         write_heat_png(path, window.width, window.height, &shown.map, most)?;
         let name = shown_name(&shown.layer);
-        eprintln!("wrote {}: {name}, black 0 to pale yellow {most}", path.display());
+        note(format_args!(
+            "wrote {}: {name}, black 0 to pale yellow {most}",
+            path.display()
+        ));
     }
     let within = args.threshold.map(|threshold| fits(&difference, threshold));
     if args.json {

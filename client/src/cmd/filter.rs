@@ -1,5 +1,6 @@
 //! `filter`: what a scene's light does at the points of a cloud, baked onto the cloud.
 
+use super::answer::note;
 use super::args::{OutputArgs, QualityArgs, ReadingArgs, ServerArgs, StatsArgs};
 use super::failure::Failure;
 use super::files::{self, Existing};
@@ -169,7 +170,7 @@ pub(crate) async fn filter(args: FilterArgs, interrupt: &Interrupt) -> Result<()
     // Not given up on a signal: the writer sees it, and removes the half-written file.
     let written = tokio::task::spawn_blocking(move || write(&plan, &values, count, &mut progress, &aside)).await;
     let bytes = written.unwrap_or_else(|error| Err(Failure::failed(format!("defect: {error}"))))?;
-    eprintln!("wrote {}", args.output.output.display());
+    note(format_args!("wrote {}", args.output.output.display()));
     statistics.bytes_written = Some(bytes as f64);
     statistics.sort_seconds = Some(sort_seconds);
     statistics.points_skipped = Some(skipped as f64);

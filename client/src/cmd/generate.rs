@@ -1,5 +1,6 @@
 //! `generate`: a procedural scene of any size, as points or as triangles.
 
+use super::answer::note;
 use super::args::{OutputArgs, StatsArgs};
 use super::failure::Failure;
 use super::files::{self, Existing};
@@ -46,7 +47,7 @@ pub(crate) async fn generate(args: GenerateArgs, interrupt: &Interrupt) -> Resul
     // Not given up on a signal: the writer sees it, and removes the half-written file.
     let written = tokio::task::spawn_blocking(move || write(kind, points, seed, &output, &aside)).await;
     let statistics = written.unwrap_or_else(|error| Err(Failure::failed(format!("defect: {error}"))))?;
-    eprintln!("wrote {}", args.output.output.display());
+    note(format_args!("wrote {}", args.output.output.display()));
     summary::report(&statistics, args.stats.stats.as_deref())
 }
 

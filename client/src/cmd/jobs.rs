@@ -1,6 +1,6 @@
 //! `build`, `shade`, and what is done with jobs: `jobs`, `watch`, `cancel`.
 
-use super::answer::say;
+use super::answer::{note, say};
 use super::args::{
     CloudArgs, DensityArgs, FormArgs, JobArgs, OctreeArgs, OutputArgs, PassArgs, QualityArgs, RunningArgs, SeenArgs,
     ServerArgs, StatsArgs,
@@ -203,7 +203,7 @@ async fn run(
         }
         session::follow(&client, &submitted.id, interrupt, &mut progress).await?
     };
-    eprintln!("wrote {}", output.output.display());
+    note(format_args!("wrote {}", output.output.display()));
     summary::report(&statistics, stats.stats.as_deref())
 }
 
@@ -239,7 +239,7 @@ pub(crate) async fn list(args: ListArgs, interrupt: &Interrupt) -> Result<(), Fa
         return say(&summary::pretty(&jobs));
     }
     if jobs.is_empty() {
-        eprintln!("no jobs yet");
+        note(format_args!("no jobs yet"));
     }
     let width = jobs.iter().map(|job| job.id.len()).max().unwrap_or(0);
     for job in &jobs {
@@ -354,7 +354,7 @@ pub(crate) async fn watch(args: WatchArgs, interrupt: &Interrupt) -> Result<(), 
         }
     };
     let statistics = session::ended(&job)?;
-    eprintln!("{} succeeded", job.id);
+    note(format_args!("{} succeeded", job.id));
     summary::report(&statistics, args.stats.stats.as_deref())
 }
 

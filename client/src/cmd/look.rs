@@ -1,5 +1,6 @@
 //! Pictures for people: a PNG file beside the EXR file, a preview in the terminal.
 
+use super::answer::note;
 use super::failure::Failure;
 use super::files::{self, Existing};
 use clap::Args;
@@ -85,7 +86,7 @@ impl Look {
     pub(crate) fn show(&self, window: Window, pixels: &[[f32; 3]]) -> Result<(), Failure> {
         if let Some(path) = &self.png {
             write_png(path, window.width, window.height, pixels, self.tone_map)?;
-            eprintln!("wrote {}", path.display());
+            note(format_args!("wrote {}", path.display()));
         }
         if self.preview {
             preview(window, &tone_mapped(pixels, self.tone_map))?;
@@ -98,7 +99,7 @@ impl Look {
 fn preview(window: Window, bytes: &[u8]) -> Result<(), Failure> {
     let terminal = console::Term::stdout();
     if !terminal.is_term() {
-        eprintln!("no preview: the output is no terminal");
+        note(format_args!("no preview: the output is no terminal"));
         return Ok(());
     }
     let (_, columns) = terminal.size();

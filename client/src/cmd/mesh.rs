@@ -1,5 +1,6 @@
 //! `sample` and `gbuffer`: what is made of a mesh here, without a daemon.
 
+use super::answer::note;
 use super::args::{CameraArgs, CloudArgs, DensityArgs, OutputArgs, StatsArgs};
 use super::failure::Failure;
 use super::files::{self, Existing};
@@ -48,7 +49,7 @@ pub(crate) async fn sample(args: SampleArgs, interrupt: &Interrupt) -> Result<()
     // Not given up on a signal: the writer sees it, and removes the half-written file.
     let written = tokio::task::spawn_blocking(move || write_points(&inputs, &output, &options, &aside)).await;
     let statistics = written.unwrap_or_else(|error| Err(Failure::failed(format!("defect: {error}"))))?;
-    eprintln!("wrote {}", args.output.output.display());
+    note(format_args!("wrote {}", args.output.output.display()));
     summary::report(&statistics, args.stats.stats.as_deref())
 }
 
@@ -113,7 +114,7 @@ pub(crate) async fn gbuffer(args: GbufferArgs, interrupt: &Interrupt) -> Result<
         interrupt.blocking(move || frame::render(&scene, args.camera)).await?
     };
     gbuffer.write(&output)?;
-    eprintln!("wrote {}", args.output.output.display());
+    note(format_args!("wrote {}", args.output.output.display()));
     let bytes = std::fs::metadata(&output).map_or(0, |metadata| metadata.len());
     let statistics = Statistics {
         holes: Some(gbuffer.hole_count() as f64),

@@ -127,7 +127,7 @@ pub(crate) fn run(arguments: Arguments) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("error: {failure}");
+            answer::note(format_args!("error: {failure}"));
             failure.exit_code()
         }
     }

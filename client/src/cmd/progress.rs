@@ -1,5 +1,6 @@
 //! Progress of a job: a bar on a terminal, a line now and then elsewhere. All of it goes to standard error.
 
+use super::answer::note;
 use indicatif::{ProgressBar, ProgressStyle};
 use pbgi_client::{Job, JobState};
 use std::io::IsTerminal;
@@ -68,8 +69,8 @@ impl Progress {
     /// A line that stays, above the bar.
     pub(crate) fn say(&self, text: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{text}")),
-            None => eprintln!("{text}"),
+            Some(bar) => bar.suspend(|| note(format_args!("{text}"))),
+            None => note(format_args!("{text}")),
         }
     }
 
@@ -85,9 +86,9 @@ impl Progress {
         match step {
             Some(step) if !first => {
                 let pace = pace(done, total, self.started.elapsed().as_secs_f64());
-                eprintln!("{}: {} %{pace}", self.stage, step * PLAIN_STEP);
+                note(format_args!("{}: {} %{pace}", self.stage, step * PLAIN_STEP));
             }
-            _ if first => eprintln!("{} ...", self.stage),
+            _ if first => note(format_args!("{} ...", self.stage)),
             _ => {}
         }
     }

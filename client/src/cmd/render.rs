@@ -1,5 +1,6 @@
 //! `render` and `demo`: from a mesh to a picture in one command.
 
+use super::answer::note;
 use super::args::{CameraArgs, DensityArgs, OutputArgs, QualityArgs, ServerArgs, Size, StatsArgs};
 use super::composite::composite;
 use super::failure::Failure;
@@ -223,7 +224,7 @@ pub(crate) fn add(statistics: &mut Statistics, shading: &Statistics) {
 fn write(plan: &Plan, gbuffer: &GBuffer, shaded: &Path, statistics: &Statistics) -> Result<(), Failure> {
     let image = composite(gbuffer, LayeredImage::read_exr(shaded)?, statistics)?;
     image.write_exr(&plan.output)?;
-    eprintln!("wrote {}", plan.output.display());
+    note(format_args!("wrote {}", plan.output.display()));
     plan.look.show(image.data_window, &image.triple("").unwrap_or_default())
 }
 

@@ -1,6 +1,6 @@
 //! The statistics: a table for people, one flat JSON object for programs.
 
-use super::answer::say;
+use super::answer::{note, say};
 use super::failure::Failure;
 use super::files;
 use pbgi_client::size::scaled_bytes;
@@ -13,7 +13,7 @@ use std::path::Path;
 pub(crate) fn report(statistics: &Statistics, file: Option<&Path>) -> Result<(), Failure> {
     say(&table(statistics))?;
     if let Some(text) = statistics.diagnosis() {
-        eprintln!("note: {text}");
+        note(format_args!("note: {text}"));
     }
     match file {
         Some(path) => files::write_whole(path, json(statistics).as_bytes()),

@@ -1,6 +1,7 @@
 //! Options about how files become points, and points an octree.
 
 use super::{Size, picture_size, positive, triple};
+use crate::cmd::answer::note;
 use crate::cmd::failure::Failure;
 use crate::cmd::files;
 use clap::Args;
@@ -114,7 +115,9 @@ impl CloudArgs {
         let origin = pbgi_points::origin_of(inputs, &self.options())?;
         if origin != [0.0; 3] {
             let [x, y, z] = origin;
-            eprintln!("positions are relative to {x},{y},{z} of the files (--origin)");
+            note(format_args!(
+                "positions are relative to {x},{y},{z} of the files (--origin)"
+            ));
         }
         Ok(())
     }
