@@ -286,6 +286,18 @@ fn a_picture_to_look_at_is_one_of_this_machine() {
 }
 
 #[test]
+fn command_whose_words_nobody_reads_goes_on() {
+    let home = tempfile::tempdir().unwrap();
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let output = home.path().join("tree.ply");
+    let mut command = client(home.path());
+    command.args(["generate", "tree", "--points", "1000", "-o"]).arg(&output);
+    assert!(command.stderr(writer).status().unwrap().success());
+    assert!(output.metadata().unwrap().len() > 1000);
+}
+
+#[test]
 fn a_reader_that_has_seen_enough_is_no_failure() {
     let home = tempfile::tempdir().unwrap();
     triangle(home.path());
