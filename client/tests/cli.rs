@@ -292,7 +292,9 @@ fn command_whose_words_nobody_reads_goes_on() {
     drop(reader);
     let output = home.path().join("tree.ply");
     let mut command = client(home.path());
-    command.args(["generate", "tree", "--points", "1000", "-o"]).arg(&output);
+    command
+        .args(["generate", "tree", "--points", "1000", "-o"])
+        .arg(&output);
     assert!(command.stderr(writer).status().unwrap().success());
     assert!(output.metadata().unwrap().len() > 1000);
 }

@@ -41,7 +41,7 @@ enum Form {
 /// A lamp where it is put.
 pub(super) enum Put {
     Light(Light),
-    Surface(Box<Geometry>, Material),
+    Surface(Box<Geometry>, Box<Material>),
 }
 
 /// The light of a prim of this type; `None` for other types.
@@ -123,7 +123,7 @@ impl Lamp {
             double_sided: false,
             ..Material::default()
         };
-        Put::Surface(Box::new(surface), material)
+        Put::Surface(Box::new(surface), Box::new(material))
     }
 
     fn strength(&self, factor: f64) -> [f32; 3] {

@@ -76,7 +76,7 @@ fn gather(path: &Path, branch: Branch, walk: Walk<'_>, room: Room) -> Result<Sce
         match lamp.put(&place) {
             Put::Light(light) => parts.lights.push(light),
             Put::Surface(mut surface, material) => {
-                surface.materials = vec![materials.own(material); surface.triangles.len()];
+                surface.materials = vec![materials.own(*material); surface.triangles.len()];
                 world.append(path, &surface, &place)?;
                 room.fits(world.memory_bytes() as u64)?;
             }
