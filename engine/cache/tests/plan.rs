@@ -38,11 +38,15 @@ fn budgets() -> impl Strategy<Value = CacheBudget> {
     )
 }
 
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(10_000))]
+const CASES: u32 = 10_000;
 
-    #[test]
-    fn accepted_budget_keeps_an_evictable_frame(budget in budgets()) {
+#[test]
+fn accepted_budget_keeps_an_evictable_frame() {
+    let config = ProptestConfig {
+        failure_persistence: None,
+        ..ProptestConfig::with_cases(CASES)
+    };
+    proptest!(config, |(budget in budgets())| {
         match budget.plan() {
             Ok(layout) => {
                 keeps_an_evictable_frame(&layout);
@@ -69,7 +73,12 @@ proptest! {
             }
             Err(other) => prop_assert!(false, "{}", other),
         }
-    }
+    });
+    println!("RELIABILITY S9: {CASES} budgets, each with a frame to evict in every pool or refused");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(CASES))]
 
     #[test]
     fn accepted_numbers_keep_an_evictable_frame(
