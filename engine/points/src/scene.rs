@@ -35,6 +35,8 @@ pub(crate) struct Geometry {
     pub(crate) normals: Vec<[f32; 3]>,
     /// Two sets of texture coordinates, each a pair a position, or empty.
     pub(crate) uvs: [Vec<[f32; 2]>; 2],
+    /// A factor of the albedo a position, linear; or empty.
+    pub(crate) colors: Vec<[f32; 3]>,
     pub(crate) triangles: Vec<[u32; 3]>,
     /// A material a triangle.
     pub(crate) materials: Vec<u32>,
@@ -258,7 +260,9 @@ impl MeshScene {
             Vec3::ZERO
         };
         Appearance {
-            albedo: Vec3::from(material.albedo) * textured(&material.albedo_texture),
+            albedo: Vec3::from(material.albedo)
+                * textured(&material.albedo_texture)
+                * geometry.color(triangle, barycentric),
             emission,
             double_sided: material.double_sided,
         }
@@ -372,7 +376,11 @@ impl SceneParts {
             instance.geometry += geometries as u32;
         }
         for material in &mut other.materials {
-            let slots = [&mut material.albedo_texture, &mut material.emission_texture];
+            let slots = [
+                &mut material.albedo_texture,
+                &mut material.opacity_texture,
+                &mut material.emission_texture,
+            ];
             slots.into_iter().flatten().for_each(|slot| slot.texture += textures);
         }
         self.geometries.append(&mut other.geometries);
@@ -421,7 +429,8 @@ impl Geometry {
     pub(crate) fn memory_bytes(&self) -> usize {
         let vertices = size_of_val(&self.positions[..])
             + size_of_val(&self.normals[..])
-            + self.uvs.iter().map(|uvs| size_of_val(&uvs[..])).sum::<usize>();
+            + self.uvs.iter().map(|uvs| size_of_val(&uvs[..])).sum::<usize>()
+            + size_of_val(&self.colors[..]);
         vertices + self.triangles.len() * limits::TRIANGLE_BYTES
     }
 
@@ -437,6 +446,14 @@ impl Geometry {
                 .map_or(Vec2::ZERO, |uv| Vec2::from(*uv))
         };
         let [a, b, c] = self.triangles[triangle].map(corner);
+        a * (1.0 - v - w) + b * v + c * w
+    }
+
+    fn color(&self, triangle: usize, [v, w]: Barycentric) -> Vec3 {
+        if self.colors.is_empty() {
+            return Vec3::ONE;
+        }
+        let [a, b, c] = self.triangles[triangle].map(|index| Vec3::from(self.colors[index as usize]));
         a * (1.0 - v - w) + b * v + c * w
     }
 

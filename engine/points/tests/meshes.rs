@@ -271,6 +271,40 @@ fn a_wavefront_opacity_map_cuts_holes_by_its_brightness_or_its_alpha() {
         assert!(points.len() > 400, "{}", points.len());
         assert!(points.iter().all(|point| point.position[0] < 0.51));
     }
+    // Behind another mesh with a texture of its own.
+    let other = folder.path().join("b.obj");
+    fs::write(&other, text.replace("a.mtl", "b.mtl").replace("leaf", "wall")).unwrap();
+    fs::write(folder.path().join("b.mtl"), "newmtl wall\nmap_Kd white.png\n").unwrap();
+    image::GrayImage::from_pixel(2, 2, image::Luma([255]))
+        .save(folder.path().join("white.png"))
+        .unwrap();
+    let scene = folder.path().join("both.toml");
+    let meshes = "[[mesh]]\nfile = \"b.obj\"\ntranslate = [0, 0, 3]\n[[mesh]]\nfile = \"a.obj\"\n";
+    fs::write(&scene, meshes).unwrap();
+    let points = sample(MeshScene::load(&scene).unwrap(), Density::Points(1000));
+    let leaf = points.iter().filter(|point| point.position[2] < 1.0);
+    assert!(leaf.clone().count() > 200);
+    assert!(leaf.clone().all(|point| point.position[0] < 0.51));
+}
+
+#[test]
+fn colours_of_a_ply_meshs_vertices_are_its_albedo() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    let head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n\
+        property uchar red\nproperty uchar green\nproperty uchar blue\n\
+        element face 1\nproperty list uchar int vertex_indices\nend_header\n";
+    // Red on the left, blue on the right; sRGB 188 is half of white.
+    let body = "0 0 0 188 0 0\n1 0 0 0 0 188\n1 1 0 0 0 188\n0 1 0 188 0 0\n4 0 1 2 3\n";
+    fs::write(&path, format!("{head}{body}")).unwrap();
+    let points = sample(MeshScene::load(&path).unwrap(), Density::Points(500));
+    assert!(points.len() > 400);
+    for point in points {
+        let [red, green, blue] = point.reflectance().albedo;
+        let x = point.position[0];
+        assert!((red - 0.5 * (1.0 - x)).abs() < 0.01, "{x} {red}");
+        assert!(green == 0.0 && (blue - 0.5 * x).abs() < 0.01, "{x} {blue}");
+    }
 }
 
 #[test]

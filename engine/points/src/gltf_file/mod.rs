@@ -146,12 +146,14 @@ impl Geometry {
             }
             self.positions.push(world.to_array());
         }
-        pad(&mut self.normals, &other.normals, base, other.positions.len());
+        let added = other.positions.len();
+        pad(&mut self.normals, &other.normals, base, added, [0.0; 3]);
+        pad(&mut self.colors, &other.colors, base, added, [1.0; 3]);
         if let Some(new) = self.normals.get_mut(base..) {
             turn_normals(new, transform.matrix3);
         }
         for (mine, theirs) in self.uvs.iter_mut().zip(&other.uvs) {
-            pad(mine, theirs, base, other.positions.len());
+            pad(mine, theirs, base, added, [0.0; 2]);
         }
         let mirrored = transform.matrix3.determinant() < 0.0;
         for (&[a, b, c], &material) in other.triangles.iter().zip(&other.materials) {
@@ -167,14 +169,15 @@ impl Geometry {
     }
 }
 
-/// Appends attributes of `count` vertices after `base` others, keeping an attribute that nobody has empty.
-fn pad<const N: usize>(mine: &mut Vec<[f32; N]>, theirs: &[[f32; N]], base: usize, count: usize) {
+/// Appends attributes of `count` vertices after `base` others, keeping an attribute that nobody has empty. Who lacks it gets
+/// `missing`.
+fn pad<const N: usize>(mine: &mut Vec<[f32; N]>, theirs: &[[f32; N]], base: usize, count: usize, missing: [f32; N]) {
     if mine.is_empty() && theirs.is_empty() {
         return;
     }
-    mine.resize(base, [0.0; N]);
+    mine.resize(base, missing);
     mine.extend_from_slice(&theirs[..theirs.len().min(count)]);
-    mine.resize(base + count, [0.0; N]);
+    mine.resize(base + count, missing);
 }
 
 fn turn_normals(normals: &mut [[f32; 3]], world_from_local: DMat3) {

@@ -1,9 +1,9 @@
-//! PLY meshes: vertices and faces, read whole. Colours and texture coordinates are not looked at.
+//! PLY meshes: vertices with normals and colours, and faces, read whole. Texture coordinates are not looked at.
 
 use super::header::{Element, Encoding, Header, PropertyKind, Scalar};
 use crate::error::PointsError;
 use crate::limits;
-use crate::material::Material;
+use crate::material::{LINEAR_FROM_SRGB, Material};
 use crate::scene::{Geometry, Instance, SceneParts};
 use glam::DAffine3;
 use std::fs::File;
@@ -65,7 +65,7 @@ pub(crate) fn read(path: &Path) -> Result<SceneParts, PointsError> {
         geometries: vec![world],
         instances: vec![Instance::new(0, &DAffine3::IDENTITY)],
         materials: vec![Material {
-            albedo: GREY,
+            albedo: if mesh.colors.is_empty() { GREY } else { [1.0; 3] },
             ..Material::default()
         }],
         ..SceneParts::default()
@@ -81,6 +81,12 @@ fn read_vertices(numbers: &mut Numbers<'_>, element: &Element, mesh: &mut Geomet
     let position = columns(["x", "y", "z"])
         .ok_or_else(|| PointsError::invalid(numbers.path, "element \"vertex\" lacks x, y or z"))?;
     let normal = columns(["nx", "ny", "nz"]);
+    // Bytes, as scanners and editors write them; other kinds of colour have no agreed meaning.
+    let bytes = |columns: &[usize; 3]| {
+        let is_byte = |&column: &usize| matches!(element.properties[column].kind, PropertyKind::Scalar(Scalar::U8));
+        columns.iter().all(is_byte)
+    };
+    let color = columns(["red", "green", "blue"]).filter(bytes);
     let mut row = Vec::new();
     for index in 0..element.count {
         numbers.row(element, &mut row)?;
@@ -92,6 +98,9 @@ fn read_vertices(numbers: &mut Numbers<'_>, element: &Element, mesh: &mut Geomet
         }
         mesh.positions.push(place);
         mesh.normals.extend(normal.map(triple));
+        let linear =
+            |columns: [usize; 3]| columns.map(|column| LINEAR_FROM_SRGB[row[column].clamp(0.0, 255.0) as usize]);
+        mesh.colors.extend(color.map(linear));
     }
     Ok(())
 }

@@ -120,6 +120,9 @@ fn placed(mut parts: SceneParts, mesh: &Mesh, places: &[DAffine3]) -> SceneParts
                 ..Material::default()
             };
         }
+        for geometry in &mut parts.geometries {
+            geometry.colors.clear();
+        }
     }
     parts
 }
