@@ -12,6 +12,9 @@ use std::path::Path;
 /// Prints the table, and writes the file if one is asked for.
 pub(crate) fn report(statistics: &Statistics, file: Option<&Path>) -> Result<(), Failure> {
     say(&table(statistics))?;
+    if let Some(text) = slowest_stage(statistics) {
+        note(format_args!("{text}"));
+    }
     if let Some(text) = statistics.diagnosis() {
         note(format_args!("note: {text}"));
     }
@@ -19,6 +22,18 @@ pub(crate) fn report(statistics: &Statistics, file: Option<&Path>) -> Result<(),
         Some(path) => files::write_whole(path, json(statistics).as_bytes()),
         None => Ok(()),
     }
+}
+
+/// What a build spent most of its time on, where that is worth knowing.
+fn slowest_stage(statistics: &Statistics) -> Option<String> {
+    const WORTH_SECS: f64 = 1.0;
+    let (sort, build) = (statistics.sort_seconds?, statistics.build_seconds?);
+    let (stage, seconds) = match sort > build {
+        true => ("reading and sorting the points", sort),
+        false => ("making the octree", build),
+    };
+    let all = sort + build;
+    (all > WORTH_SECS).then(|| format!("most of the time went into {stage}: {seconds:.1} of {all:.1} s"))
 }
 
 /// Rows that have a value: name, value, unit, and the name for people.
@@ -121,6 +136,22 @@ mod tests {
         assert_eq!(object["points"], serde_json::json!(1_234_567));
         assert_eq!(object["cache_hit_ratio"], serde_json::json!(0.99964));
         assert!(object["nodes"].is_null());
+    }
+
+    #[test]
+    fn the_slowest_stage_of_a_long_build_is_named() {
+        let took = |sort, build| {
+            slowest_stage(&Statistics {
+                sort_seconds: Some(sort),
+                build_seconds: Some(build),
+                ..Default::default()
+            })
+        };
+        let text = took(1.5, 4.5).unwrap();
+        assert_eq!(text, "most of the time went into making the octree: 4.5 of 6.0 s");
+        assert!(took(4.5, 1.5).unwrap().contains("sorting the points: 4.5"));
+        assert_eq!(took(0.2, 0.3), None);
+        assert_eq!(slowest_stage(&sample()), None);
     }
 
     #[test]
