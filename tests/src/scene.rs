@@ -46,7 +46,7 @@ pub fn flip_bit(scene: &Path, file: &str, page: u64) {
 pub fn load(path: &Path) -> (SceneInfo, ArraySource) {
     let scene = Scene::open(path).unwrap();
     let info = scene.info().clone();
-    let mut source = ArraySource::default();
+    let mut source: ArraySource = ArraySource::default();
     for kind in [PageKind::Node, PageKind::Point] {
         let mut page = vec![0u64; info.page_bytes(kind).div_ceil(8)];
         for number in 0..info.page_count(kind) {

@@ -6,13 +6,15 @@ use std::ops::ControlFlow;
 /// Pages of a scene, behind whatever caches there are. Slices are valid until the next call, so that a cache of a single
 /// page is enough.
 pub trait SceneSource {
-    /// The node at an index, for some receivers of the pack that is being shaded, one bit each.
+    /// The node at an index, for some receivers of the pack that is being shaded, one bit each. `upcoming` is asked if its page has
+    /// to be fetched.
     ///
     /// # Errors
     /// The index is out of range, or its page cannot be had.
     fn node(&mut self, index: NodeIndex, receivers: u8, upcoming: &impl Upcoming) -> Result<&NodeRecord, SourceError>;
 
-    /// The points from `first` on, for some receivers: at least one, at most `count`, cut where their page ends.
+    /// The points from `first` on, for some receivers: at least one, at most `count`, cut where their page ends. `upcoming` as for
+    /// [`Self::node`].
     ///
     /// # Errors
     /// The range is out of bounds, or its page cannot be had.
@@ -81,20 +83,21 @@ pub enum SourceError {
     Io(String),
 }
 
-/// A scene that lies in memory as plain arrays.
+/// A scene that lies in memory as plain arrays, its own or borrowed.
 #[derive(Clone, Debug, Default)]
-pub struct ArraySource {
+pub struct ArraySource<N = Vec<NodeRecord>, P = Vec<PointRecord>> {
     /// Nodes by index.
-    pub nodes: Vec<NodeRecord>,
+    pub nodes: N,
     /// Points by index.
-    pub points: Vec<PointRecord>,
+    pub points: P,
 }
 
-impl SceneSource for ArraySource {
+impl<N: AsRef<[NodeRecord]>, P: AsRef<[PointRecord]>> SceneSource for ArraySource<N, P> {
     #[inline]
     fn node(&mut self, index: NodeIndex, _: u8, _: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
-        let missing = || SourceError::Corrupt(format!("node {} of {}", index.0, self.nodes.len()));
-        self.nodes.get(index.0 as usize).ok_or_else(missing)
+        let nodes = self.nodes.as_ref();
+        let missing = || SourceError::Corrupt(format!("node {} of {}", index.0, nodes.len()));
+        nodes.get(index.0 as usize).ok_or_else(missing)
     }
 
     #[inline]
@@ -105,9 +108,10 @@ impl SceneSource for ArraySource {
         _: u8,
         _: &impl Upcoming,
     ) -> Result<&[PointRecord], SourceError> {
-        let missing = || SourceError::Corrupt(format!("points {} + {count} of {}", first.0, self.points.len()));
+        let points = self.points.as_ref();
+        let missing = || SourceError::Corrupt(format!("points {} + {count} of {}", first.0, points.len()));
         let start = first.0 as usize;
-        self.points
+        points
             .get(start..start + count as usize)
             .filter(|slice| !slice.is_empty())
             .ok_or_else(missing)

@@ -6,8 +6,8 @@ use crate::policy::{arrays, tiles};
 use crate::town::Town;
 use nix::fcntl::{FcntlArg, SealFlag, fcntl};
 use nix::sys::memfd::{MFdFlags, memfd_create};
-use pbgi_core::{NodeIndex, NodeRecord, PageKind, PointIndex, PointRecord, ShadeSettings};
-use pbgi_shade::{Receiver, SceneSource, Shaded, Shader, SourceError, Upcoming};
+use pbgi_core::{NodeRecord, PageKind, PointRecord, ShadeSettings};
+use pbgi_shade::{ArraySource, Receiver, SceneSource, Shaded, Shader};
 use pbgi_store::Scene;
 use pbgi_worker::pages::{PageSource, SceneView};
 use std::fs::File;
@@ -48,41 +48,13 @@ impl Mapped {
 }
 
 impl Mapped {
-    fn slices(&self) -> Slices<'_> {
+    fn source(&self) -> ArraySource<&[NodeRecord], &[PointRecord]> {
         let nodes = &self.nodes[HEADER_BYTES..][..self.node_count * size_of::<NodeRecord>()];
         let points = &self.points[HEADER_BYTES..][..self.point_count * size_of::<PointRecord>()];
-        Slices {
+        ArraySource {
             nodes: bytemuck::cast_slice(nodes),
             points: bytemuck::cast_slice(points),
         }
-    }
-}
-
-/// The scene as slices of memory, whatever is behind them.
-struct Slices<'a> {
-    nodes: &'a [NodeRecord],
-    points: &'a [PointRecord],
-}
-
-impl SceneSource for Slices<'_> {
-    #[inline]
-    fn node(&mut self, index: NodeIndex, _: u8, _: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
-        self.nodes
-            .get(index.0 as usize)
-            .ok_or_else(|| SourceError::Corrupt("node out of range".into()))
-    }
-
-    #[inline]
-    fn points(
-        &mut self,
-        first: PointIndex,
-        count: u32,
-        _: u8,
-        _: &impl Upcoming,
-    ) -> Result<&[PointRecord], SourceError> {
-        self.points
-            .get(first.0 as usize..first.0 as usize + count as usize)
-            .ok_or_else(|| SourceError::Corrupt("points out of range".into()))
     }
 }
 
@@ -99,12 +71,8 @@ pub(crate) fn print(scene: &Scene) {
     let info = scene.info();
     let receivers = Town::new(info.point_count).receivers(SIZE.0, SIZE.1);
     let tiles = tiles(&receivers, SIZE);
-    let (arrays, mapped) = (arrays(scene), Mapped::open(scene));
-    let mut arrays = Slices {
-        nodes: &arrays.nodes,
-        points: &arrays.points,
-    };
-    let mut mapped = mapped.slices();
+    let (mut arrays, mapped) = (arrays(scene), Mapped::open(scene));
+    let mut mapped = mapped.source();
     // Half of the frames may be held by the worker, and all pages fit into that half.
     let frames = |kind| 2 * info.page_count(kind) as u32 + 8;
     let owner = owner(info, frames(PageKind::Node), frames(PageKind::Point));
