@@ -48,6 +48,8 @@ struct Surface {
     albedo: [f32; 3],
     takes_color: bool,
     albedo_map: Option<Map>,
+    /// `None` where the alpha of the albedo's map tells it.
+    opacity_map: Option<Map>,
     emission: [f32; 3],
     emission_map: Option<Map>,
     alpha: f32,
@@ -73,11 +75,13 @@ struct Picture {
     wrap: [Wrap; 2],
 }
 
-/// The pixels of a texture: a picture's colours (with the picture's raw ones encoded), the opacity of a channel of another.
+/// What a picture's pixels are made into.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
-struct Pixels {
-    color: Option<(String, bool)>,
-    opacity: Option<(String, usize)>,
+enum Pixels {
+    /// Colours, and whether they are raw, so that they have to be encoded.
+    Color(String, bool),
+    /// The opacity that this channel holds.
+    Opacity(String, usize),
 }
 
 /// All materials and textures of a stage, each once.
@@ -113,7 +117,7 @@ impl Materials {
     /// Names of the texture coordinates that a material uses.
     pub(super) fn primvars_of(&mut self, values: &Values, skin: &Skin) -> Result<Vec<String>, PointsError> {
         let surface = self.surface(values, skin)?;
-        let maps = [&surface.albedo_map, &surface.emission_map];
+        let maps = [&surface.albedo_map, &surface.opacity_map, &surface.emission_map];
         Ok(maps.into_iter().flatten().map(|map| map.primvar.clone()).collect())
     }
 
@@ -136,7 +140,7 @@ impl Materials {
                 albedo: surface.albedo,
                 alpha: surface.alpha,
                 albedo_texture: slot(&surface.albedo_map),
-                opacity_texture: None,
+                opacity_texture: slot(&surface.opacity_map),
                 emission: surface.emission,
                 emission_texture: slot(&surface.emission_map),
                 cutoff: surface.cutoff,
@@ -230,7 +234,14 @@ impl Materials {
         let cutoff = if threshold > 0.0 { threshold } else { CUTOFF_DEFAULT };
         // What no texture cuts out is all there or not at all.
         surface.cutoff = (opacity.is_some() || surface.alpha < cutoff).then_some(cutoff);
-        surface.albedo_map = self.albedo_map(values, shader, colors, opacity)?;
+        if let Some((picture, channel)) = opacity.filter(|(picture, channel)| !is_alpha_of(picture, *channel, &colors))
+        {
+            let pixels = Pixels::Opacity(picture.file.clone(), channel);
+            surface.opacity_map = Some(picture.map(self.texture(pixels)?));
+        }
+        if let Some(picture) = colors {
+            surface.albedo_map = Some(picture.map(self.texture(picture.colors())?));
+        }
         match values.input(shader, "inputs:emissiveColor")? {
             Input::None => {}
             Input::Value(value) => surface.emission = color_of(values, shader, &value)?,
@@ -238,84 +249,46 @@ impl Materials {
             Input::Shader(source, _) => {
                 let picture = picture(values, &source)?;
                 surface.emission = [picture.scale[0], picture.scale[1], picture.scale[2]];
-                let pixels = Pixels {
-                    color: Some((picture.file.clone(), picture.raw)),
-                    opacity: None,
-                };
-                surface.emission_map = Some(picture.map(self.texture(values, shader, pixels)?));
+                surface.emission_map = Some(picture.map(self.texture(picture.colors())?));
             }
         }
         Ok(surface)
     }
 
-    /// Colour and opacity are one texture of ours.
-    fn albedo_map(
-        &mut self,
-        values: &Values,
-        shader: &Prim,
-        colors: Option<Picture>,
-        opacity: Option<(Picture, usize)>,
-    ) -> Result<Option<Map>, PointsError> {
-        let Some(lead) = colors.as_ref().or(opacity.as_ref().map(|(picture, _)| picture)) else {
-            return Ok(None);
-        };
-        if let Some((other, _)) = &opacity
-            && !(other.primvar == lead.primvar && other.transform == lead.transform && other.wrap == lead.wrap)
-        {
-            let what = "textures of colour and opacity that lie differently";
-            return Err(values.unsupported(shader, what, "give them the same coordinates and wrapping"));
-        }
-        let pixels = Pixels {
-            color: colors.as_ref().map(|picture| (picture.file.clone(), picture.raw)),
-            opacity: opacity
-                .as_ref()
-                .map(|(picture, channel)| (picture.file.clone(), *channel)),
-        };
-        Ok(Some(lead.map(self.texture(values, shader, pixels)?)))
-    }
-
-    fn texture(&mut self, values: &Values, shader: &Prim, pixels: Pixels) -> Result<usize, PointsError> {
+    fn texture(&mut self, pixels: Pixels) -> Result<usize, PointsError> {
         if let Some(&known) = self.pixels.get(&pixels) {
             return Ok(known);
         }
-        let read = |file: &str| decode(Path::new(file), &self.files.picture(file)?);
-        let mut texture = match (&pixels.color, &pixels.opacity) {
-            (Some((file, _)), _) => read(file)?,
-            (None, Some((file, _))) => read(file)?,
-            (None, None) => return Err(values.wrong(shader, "a texture without a picture")),
-        };
-        let cut = match (&pixels.color, &pixels.opacity) {
-            // The picture itself, before its colours are changed.
-            (Some((color, _)), Some((file, 3))) if color == file => None,
-            (_, Some((file, channel))) => Some((read(file)?, *channel)),
-            (_, None) => None,
-        };
-        match pixels.color {
-            Some((_, true)) => {
-                let encoded: Vec<u8> = (0..=u8::MAX).map(encoded).collect();
-                for [r, g, b, _] in &mut texture.texels {
-                    (*r, *g, *b) = (
-                        encoded[usize::from(*r)],
-                        encoded[usize::from(*g)],
-                        encoded[usize::from(*b)],
-                    );
+        let (Pixels::Color(file, _) | Pixels::Opacity(file, _)) = &pixels;
+        let mut texture = decode(Path::new(file), &self.files.picture(file)?)?;
+        match pixels {
+            Pixels::Color(_, false) => {}
+            Pixels::Color(_, true) => {
+                let table: Vec<u8> = (0..=u8::MAX).map(encoded).collect();
+                for color in texture.texels.iter_mut().flat_map(|texel| &mut texel[..3]) {
+                    *color = table[usize::from(*color)];
                 }
             }
-            Some((_, false)) => {}
-            None => texture.texels.iter_mut().for_each(|texel| texel[..3].fill(u8::MAX)),
-        }
-        if let Some((cut, channel)) = cut {
-            let (wide, high) = (texture.width as usize, texture.height as usize);
-            for (index, texel) in texture.texels.iter_mut().enumerate() {
-                let column = index % wide * cut.width as usize / wide;
-                let row = index / wide * cut.height as usize / high;
-                texel[3] = cut.texels[row * cut.width as usize + column][channel];
-            }
+            Pixels::Opacity(_, channel) => texture.texels.iter_mut().for_each(|texel| texel[3] = texel[channel]),
         }
         self.textures.push(texture);
         self.pixels.insert(pixels, self.textures.len() - 1);
         Ok(self.textures.len() - 1)
     }
+}
+
+/// Whether the opacity in a picture's channel is the alpha of the colours.
+fn is_alpha_of(picture: &Picture, channel: usize, colors: &Option<Picture>) -> bool {
+    const ALPHA: usize = 3;
+    let lies = |picture: &Picture| {
+        (
+            picture.file.clone(),
+            picture.primvar.clone(),
+            picture.transform,
+            picture.wrap,
+        )
+    };
+    channel == ALPHA && colors.as_ref().is_some_and(|colors| lies(colors) == lies(picture))
 }
 
 /// The sRGB level of a linear one.
@@ -324,6 +297,10 @@ fn encoded(level: u8) -> u8 {
 }
 
 impl Picture {
+    fn colors(&self) -> Pixels {
+        Pixels::Color(self.file.clone(), self.raw)
+    }
+
     fn map(&self, texture: usize) -> Map {
         Map {
             texture,
