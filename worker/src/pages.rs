@@ -139,12 +139,11 @@ impl FileView {
 }
 
 /// Where the last access to a file went: the next one is likely to go there too.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Place {
-    key: PageKey,
     /// Index of the page's first record.
     first: u32,
-    /// Records of the file in this page.
+    /// Records of the file in this page. Without any there was no access yet.
     count: u32,
     /// Receivers of the pack that are known to touch it.
     receivers: u8,
@@ -156,7 +155,7 @@ pub struct PageSource<'a> {
     pages: &'a mut Pages,
     scene: &'a mut SceneView,
     job: u64,
-    places: [Option<Place>; 2],
+    places: [Place; 2],
     counters: TileCounters,
     accesses: u64,
     fault: Option<Fault>,
@@ -171,7 +170,7 @@ impl<'a> PageSource<'a> {
             pages,
             scene,
             job,
-            places: [None; 2],
+            places: [Place::default(); 2],
             counters: TileCounters::default(),
             accesses: 0,
             fault: None,
@@ -195,22 +194,22 @@ impl<'a> PageSource<'a> {
         self.fault.take().map(|Fault(kind, text)| (kind, text))
     }
 
-    /// The place of a record, its page pinned.
-    #[inline]
-    fn place(
+    /// Where in its page a record is; the page is pinned, and the cache's last one of its kind.
+    #[inline(always)]
+    fn slot(
         &mut self,
         kind: PageKind,
         index: u32,
         receivers: u8,
         upcoming: &impl Upcoming,
-    ) -> Result<Place, SourceError> {
+    ) -> Result<u32, SourceError> {
         self.accesses += u64::from(receivers.count_ones());
-        match self.places[kind as usize] {
-            // Still pinned: it is the page of this kind that was used last.
-            Some(place) if index.wrapping_sub(place.first) < place.count && receivers & !place.receivers == 0 => {
-                Ok(place)
-            }
-            _ => self.turn_to(kind, index, receivers, upcoming),
+        let place = &self.places[kind as usize];
+        let slot = index.wrapping_sub(place.first);
+        if slot < place.count && receivers & !place.receivers == 0 {
+            Ok(slot)
+        } else {
+            self.turn_to(kind, index, receivers, upcoming)
         }
     }
 
@@ -221,7 +220,7 @@ impl<'a> PageSource<'a> {
         index: u32,
         receivers: u8,
         upcoming: &impl Upcoming,
-    ) -> Result<Place, SourceError> {
+    ) -> Result<u32, SourceError> {
         let pack = self.scene.pack;
         let mount = self.scene.mount;
         let file = match kind {
@@ -247,15 +246,14 @@ impl<'a> PageSource<'a> {
             self.load(key, upcoming)?;
             self.pages.cache.get(key);
         }
-        let before = self.places[kind as usize].filter(|place| place.key == key);
-        let place = Place {
-            key,
+        let before = self.places[kind as usize];
+        let same = before.count != 0 && before.first == first;
+        self.places[kind as usize] = Place {
             first,
             count,
-            receivers: receivers | before.map_or(0, |place| place.receivers),
+            receivers: if same { before.receivers | receivers } else { receivers },
         };
-        self.places[kind as usize] = Some(place);
-        Ok(place)
+        Ok(index - first)
     }
 
     #[cold]
@@ -273,7 +271,7 @@ impl<'a> PageSource<'a> {
         self.pages.slow = ahead::waited_for_disk(pages, took);
         self.counters.io_nanos += took.as_nanos() as u64;
         // Other pages may have gone to make room.
-        self.places = [None; 2];
+        self.places = [Place::default(); 2];
         for origin in loaded.map_err(|fault| self.fail(fault))? {
             match origin {
                 Origin::Loaded => self.counters.cache_misses += 1,
@@ -298,24 +296,17 @@ impl<'a> PageSource<'a> {
         self.fault = Some(fault);
         error
     }
-
-    /// The bytes of the records `range` (within the page) of a page that `place` pinned.
-    #[inline]
-    fn bytes(&mut self, place: Place, start: usize, end: usize) -> Result<&[u8], SourceError> {
-        let frame = self.pages.cache.again(place.key.kind);
-        let bytes = frame.and_then(|frame| frame.get(start..end));
-        bytes.ok_or_else(|| lost(place))
-    }
 }
 
 impl SceneSource for PageSource<'_> {
     #[inline(always)]
     fn node(&mut self, index: NodeIndex, receivers: u8, upcoming: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
         const BYTES: usize = size_of::<NodeRecord>();
-        let place = self.place(PageKind::Node, index.0, receivers, upcoming)?;
-        let start = (index.0 - place.first) as usize * BYTES;
-        let bytes = self.bytes(place, start, start + BYTES)?;
-        bytemuck::try_from_bytes(bytes).map_err(|_| lost(place))
+        let slot = self.slot(PageKind::Node, index.0, receivers, upcoming)?;
+        let page = self.pages.cache.again(PageKind::Node);
+        let start = slot as usize * BYTES;
+        let bytes = page.get(start..start + BYTES).ok_or_else(|| lost(PageKind::Node))?;
+        bytemuck::try_from_bytes(bytes).map_err(|_| lost(PageKind::Node))
     }
 
     #[inline]
@@ -330,25 +321,27 @@ impl SceneSource for PageSource<'_> {
         if count == 0 {
             return Err(self.fail(Fault(FailureKind::Corrupt, format!("no points from {} on", first.0))));
         }
-        let place = self.place(PageKind::Point, first.0, receivers, upcoming)?;
-        let slot = first.0 - place.first;
-        let count = count.min(place.count - slot);
+        let slot = self.slot(PageKind::Point, first.0, receivers, upcoming)?;
+        let count = count.min(self.places[PageKind::Point as usize].count - slot) as usize;
+        let page = self.pages.cache.again(PageKind::Point);
         let start = slot as usize * BYTES;
-        let bytes = self.bytes(place, start, start + count as usize * BYTES)?;
-        bytemuck::try_cast_slice(bytes).map_err(|_| lost(place))
+        let bytes = page
+            .get(start..start + count * BYTES)
+            .ok_or_else(|| lost(PageKind::Point))?;
+        bytemuck::try_cast_slice(bytes).map_err(|_| lost(PageKind::Point))
     }
 
     fn begin_pack(&mut self) {
         self.scene.begin_pack();
         // The stamps are looked at when the page changes: have the next access look.
-        self.places = [None; 2];
+        self.places = [Place::default(); 2];
     }
 }
 
 /// A frame that is not there or not as large as its layout says: a defect, not an input.
 #[cold]
-fn lost(place: Place) -> SourceError {
-    SourceError::Io(format!("{} page {} left the cache", place.key.kind, place.key.page.0))
+fn lost(kind: PageKind) -> SourceError {
+    SourceError::Io(format!("a {kind} page left the cache while it was used"))
 }
 
 /// Kind and text of what went wrong.

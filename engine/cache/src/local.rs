@@ -73,19 +73,20 @@ impl LocalCache {
         } else {
             self.find(key)?
         };
-        self.pools[key.kind as usize].last = Some(frame);
         // SAFETY: Rule 4: the frame is in the local cache, so its pin is held; pins are given up only by methods that
         // borrow `self` exclusively, which the result's lifetime forbids.
-        Some(unsafe { self.view.frame(key.kind, frame) })
+        let page = unsafe { self.view.frame(key.kind, frame) };
+        self.pools[key.kind as usize].last = Last { frame, page };
+        Some(page)
     }
 
-    /// The page of a kind that [`Self::get`] gave last, while it is held. Costs next to nothing, and is not counted: the page is
-    /// the most recently used one already.
+    /// The page of a kind that [`Self::get`] gave last, or nothing if it is no longer held. Costs two loads, and is not
+    /// counted: the page is the most recently used one already.
     #[inline(always)]
-    pub fn again(&self, kind: PageKind) -> Option<&[u8]> {
-        let frame = self.pools[kind as usize].last?;
-        // SAFETY: Rule 4, as in `get`: `release` forgets the frame with its pin.
-        Some(unsafe { self.view.frame(kind, frame) })
+    pub fn again(&self, kind: PageKind) -> &[u8] {
+        let last = &self.pools[kind as usize].last;
+        // SAFETY: Rule 4, as in `get`: `release` forgets the page with its pin.
+        unsafe { &*last.page }
     }
 
     /// The page, if it is in the local cache; it is not counted as a use.
@@ -145,8 +146,8 @@ impl LocalCache {
         if entry.tag == tag {
             *entry = FrontEntry::EMPTY;
         }
-        if pool.last == Some(frame) {
-            pool.last = None;
+        if pool.last.frame == frame {
+            pool.last = Last::NONE;
         }
         self.view.unpin(kind, frame);
         self.counters.evictions += 1;
@@ -250,8 +251,24 @@ struct LocalPool {
     displaced: Vec<(u64, Tag)>,
     now: u64,
     replayed: u64,
-    /// What was given out last.
-    last: Option<FrameId>,
+    last: Last,
+}
+
+/// What was given out last: the address, so that nothing has to be computed to give it again.
+#[derive(Clone, Copy, Debug)]
+struct Last {
+    frame: FrameId,
+    page: *const [u8],
+}
+
+// SAFETY: a number. It is followed only under Rule 4, whatever the thread.
+unsafe impl Send for Last {}
+
+impl Last {
+    const NONE: Self = Self {
+        frame: FrameId(u32::MAX),
+        page: &[],
+    };
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -278,7 +295,7 @@ impl LocalPool {
             displaced: Vec::with_capacity(FRONT),
             now: 0,
             replayed: 0,
-            last: None,
+            last: Last::NONE,
         }
     }
 
