@@ -3,9 +3,10 @@
 //!
 //! Only while pages come slowly, from a disk: one that the operating system holds comes sooner than the walk has told its way.
 
+use crate::view::{Place, SceneView};
 use pbgi_cache::LocalCache;
 use pbgi_cache::channel::REQUEST_PAGES_MAX;
-use pbgi_core::{MountId, NodeIndex, NodeRecord, PageKey, PageKind, PageNo, SceneInfo};
+use pbgi_core::{NodeIndex, NodeRecord, PageKey, PageKind};
 use pbgi_shade::{Upcoming, Wanted};
 use std::ops::ControlFlow;
 use std::time::Duration;
@@ -22,58 +23,27 @@ pub(crate) fn waited_for_disk(pages: usize, took: Duration) -> bool {
     took > QUICK.0 + QUICK.1 * pages as u32
 }
 
-/// Where the records of a scene lie.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Paging {
-    mount: MountId,
-    nodes_per_page: u32,
-    points_per_page: u32,
-    node_slots: u64,
-    point_count: u64,
-}
-
-impl Paging {
-    pub(crate) fn new(scene: &SceneInfo, mount: MountId) -> Self {
-        Self {
-            mount,
-            nodes_per_page: scene.settings.nodes_per_page,
-            points_per_page: scene.settings.points_per_page,
-            node_slots: scene.node_slots,
-            point_count: scene.point_count,
-        }
-    }
-
-    /// The page of a record and its place there; `None` if a forged scene points behind its end.
-    fn place(&self, kind: PageKind, index: u32) -> Option<(PageKey, usize)> {
-        let (records, per_page) = match kind {
-            PageKind::Node => (self.node_slots, self.nodes_per_page),
-            PageKind::Point => (self.point_count, self.points_per_page),
-        };
-        let key = PageKey {
-            mount: self.mount,
-            kind,
-            page: PageNo(index / per_page),
-        };
-        (u64::from(index) < records).then_some((key, (index % per_page) as usize))
-    }
-}
-
 /// The pages to ask for when `missing` is: that first, then those wanted soon, soonest first.
-pub(crate) fn request(cache: &LocalCache, paging: &Paging, missing: PageKey, upcoming: &impl Upcoming) -> Vec<PageKey> {
+pub(crate) fn request(
+    cache: &LocalCache,
+    scene: &SceneView,
+    missing: PageKey,
+    upcoming: &impl Upcoming,
+) -> Vec<PageKey> {
     let mut keys = Vec::with_capacity(REQUEST_PAGES_MAX);
     keys.push(missing);
     let peek = |index: NodeIndex| {
-        let (key, slot) = paging.place(PageKind::Node, index.0)?;
-        let start = slot * size_of::<NodeRecord>();
-        let bytes = cache.peek(key)?.get(start..start + size_of::<NodeRecord>())?;
+        let place = scene.place(PageKind::Node, index.0)?;
+        let start = place.slot as usize * size_of::<NodeRecord>();
+        let bytes = cache.peek(place.key)?.get(start..start + size_of::<NodeRecord>())?;
         bytemuck::try_from_bytes(bytes).ok()
     };
     let want = |wanted| {
         let place = match wanted {
-            Wanted::Node(index) => paging.place(PageKind::Node, index.0),
-            Wanted::Points(index) => paging.place(PageKind::Point, index.0),
+            Wanted::Node(index) => scene.place(PageKind::Node, index.0),
+            Wanted::Points(index) => scene.place(PageKind::Point, index.0),
         };
-        if let Some((key, _)) = place {
+        if let Some(Place { key, .. }) = place {
             let asked = keys.iter().filter(|asked| asked.kind == key.kind).count();
             if asked < room(cache, key.kind) && !keys.contains(&key) && cache.peek(key).is_none() {
                 keys.push(key);

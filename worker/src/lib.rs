@@ -14,6 +14,7 @@ mod shading;
 mod task;
 mod tile;
 mod tile_loop;
+mod view;
 
 pub use attach::die_with_parent;
 pub use error::WorkerError;

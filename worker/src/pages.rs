@@ -4,11 +4,13 @@
 //! is about to need (`ahead`). Indices come from files and
 //! are checked against the scene's counts, so that a forged scene ends in an error and nowhere else.
 
-use crate::ahead::{self, Paging};
+use crate::ahead;
 use crate::shading::FailureKind;
+use crate::view::Place;
+pub use crate::view::SceneView;
 use pbgi_cache::channel::{self, PageOutcome, PageRequest};
 use pbgi_cache::{CacheError, LoadErrorKind, LocalCache, Origin};
-use pbgi_core::{MountId, NodeIndex, NodeRecord, PageKey, PageKind, PageNo, PointIndex, PointRecord, SceneInfo};
+use pbgi_core::{NodeIndex, NodeRecord, PageKey, PageKind, PointIndex, PointRecord};
 use pbgi_proto::v1::TileCounters;
 use pbgi_shade::{SceneSource, SourceError, Upcoming};
 use std::os::unix::net::UnixStream;
@@ -68,94 +70,12 @@ impl Pages {
     }
 }
 
-/// What a worker knows of one mounted scene.
-#[derive(Debug)]
-pub struct SceneView {
-    mount: MountId,
-    paging: Paging,
-    nodes: FileView,
-    points: FileView,
-    /// Number of the pack of receivers that is being shaded.
-    pack: u32,
-}
-
-/// One of the scene's files.
-#[derive(Debug)]
-struct FileView {
-    kind: PageKind,
-    records: u64,
-    records_per_page: u32,
-    page_bytes: u64,
-    /// By page, who touched it last: the pack, and its receivers in the low bits.
-    stamps: Vec<u32>,
-}
-
-impl SceneView {
-    /// Prepares for a scene.
-    pub fn new(scene: &SceneInfo, mount: MountId) -> Self {
-        let file = |kind, records, records_per_page| FileView {
-            kind,
-            records,
-            records_per_page,
-            page_bytes: scene.page_bytes(kind) as u64,
-            stamps: vec![0; scene.page_count(kind) as usize],
-        };
-        Self {
-            mount,
-            paging: Paging::new(scene, mount),
-            nodes: file(PageKind::Node, scene.node_slots, scene.settings.nodes_per_page),
-            points: file(PageKind::Point, scene.point_count, scene.settings.points_per_page),
-            pack: 0,
-        }
-    }
-
-    fn begin_pack(&mut self) {
-        if self.pack == PACK_MAX {
-            self.nodes.stamps.fill(0);
-            self.points.stamps.fill(0);
-            self.pack = 0;
-        }
-        self.pack += 1;
-    }
-}
-
-/// Bits of a stamp that name receivers.
-const RECEIVER_BITS: u32 = 8;
-/// Packs that can be told apart by stamps.
-const PACK_MAX: u32 = u32::MAX >> RECEIVER_BITS;
-
-impl FileView {
-    /// Notes that receivers of a pack touch a page; says how many of them do for the first time.
-    fn touch(&mut self, page: u32, pack: u32, receivers: u8) -> Option<u32> {
-        let stamp = self.stamps.get_mut(page as usize)?;
-        let before = if *stamp >> RECEIVER_BITS == pack {
-            *stamp as u8
-        } else {
-            0
-        };
-        *stamp = pack << RECEIVER_BITS | u32::from(before | receivers);
-        Some((receivers & !before).count_ones())
-    }
-}
-
-/// Where the last access to a file went: the next one is likely to go there too.
-#[derive(Clone, Copy, Debug, Default)]
-struct Place {
-    /// Index of the page's first record.
-    first: u32,
-    /// Records of the file in this page. Without any there was no access yet.
-    count: u32,
-    /// Receivers of the pack that are known to touch it.
-    receivers: u8,
-}
-
 /// Serves the shading code for one tile.
 #[derive(Debug)]
 pub struct PageSource<'a> {
     pages: &'a mut Pages,
     scene: &'a mut SceneView,
     job: u64,
-    places: [Place; 2],
     counters: TileCounters,
     accesses: u64,
     fault: Option<Fault>,
@@ -170,7 +90,6 @@ impl<'a> PageSource<'a> {
             pages,
             scene,
             job,
-            places: [Place::default(); 2],
             counters: TileCounters::default(),
             accesses: 0,
             fault: None,
@@ -194,7 +113,9 @@ impl<'a> PageSource<'a> {
         self.fault.take().map(|Fault(kind, text)| (kind, text))
     }
 
-    /// Where in its page a record is; the page is pinned, and the cache's last one of its kind.
+    /// The place of a record in its page, which is now the cache's last one.
+    ///
+    /// Walks turn from page to page at every second look: where they go must cost the same wherever they come from.
     #[inline(always)]
     fn slot(
         &mut self,
@@ -204,15 +125,15 @@ impl<'a> PageSource<'a> {
         upcoming: &impl Upcoming,
     ) -> Result<u32, SourceError> {
         self.accesses += u64::from(receivers.count_ones());
-        let place = &self.places[kind as usize];
-        let slot = index.wrapping_sub(place.first);
-        if slot < place.count && receivers & !place.receivers == 0 {
-            Ok(slot)
-        } else {
-            self.turn_to(kind, index, receivers, upcoming)
+        let place = self.scene.place(kind, index);
+        let known = place.filter(|place| self.scene.is_touched(place.key, receivers));
+        match known {
+            Some(place) if self.pages.cache.get(place.key).is_some() => Ok(place.slot),
+            _ => self.turn_to(kind, index, receivers, upcoming),
         }
     }
 
+    /// The rare part of [`Self::slot`]: the first look of a receiver at a page, and pages that are not at hand.
     #[inline(never)]
     fn turn_to(
         &mut self,
@@ -221,39 +142,16 @@ impl<'a> PageSource<'a> {
         receivers: u8,
         upcoming: &impl Upcoming,
     ) -> Result<u32, SourceError> {
-        let pack = self.scene.pack;
-        let mount = self.scene.mount;
-        let file = match kind {
-            PageKind::Node => &mut self.scene.nodes,
-            PageKind::Point => &mut self.scene.points,
-        };
-        let page = index / file.records_per_page;
-        let key = PageKey {
-            mount,
-            kind,
-            page: PageNo(page),
-        };
-        let in_file = u64::from(index) < file.records;
-        let touched = in_file.then(|| file.touch(page, pack, receivers)).flatten();
-        let Some(newly) = touched else {
-            let text = format!("{} {index} of {}", file.kind, file.records);
+        let Some(Place { key, slot, .. }) = self.scene.place(kind, index) else {
+            let text = format!("{kind} {index} of {}", self.scene.records(kind));
             return Err(self.fail(Fault(FailureKind::Corrupt, text)));
         };
-        self.counters.traversal_bytes += u64::from(newly) * file.page_bytes;
-        let first = page * file.records_per_page;
-        let count = (file.records - u64::from(first)).min(u64::from(file.records_per_page)) as u32;
+        self.counters.traversal_bytes += self.scene.touch(key, receivers);
         if self.pages.cache.get(key).is_none() {
             self.load(key, upcoming)?;
             self.pages.cache.get(key);
         }
-        let before = self.places[kind as usize];
-        let same = before.count != 0 && before.first == first;
-        self.places[kind as usize] = Place {
-            first,
-            count,
-            receivers: if same { before.receivers | receivers } else { receivers },
-        };
-        Ok(index - first)
+        Ok(slot)
     }
 
     #[cold]
@@ -262,7 +160,7 @@ impl<'a> PageSource<'a> {
         let _entered = span.enter();
         let start = Instant::now();
         let keys = match self.pages.slow {
-            true => ahead::request(&self.pages.cache, &self.scene.paging, missing, upcoming),
+            true => ahead::request(&self.pages.cache, self.scene, missing, upcoming),
             false => vec![missing],
         };
         let pages = keys.len();
@@ -270,8 +168,6 @@ impl<'a> PageSource<'a> {
         let took = start.elapsed();
         self.pages.slow = ahead::waited_for_disk(pages, took);
         self.counters.io_nanos += took.as_nanos() as u64;
-        // Other pages may have gone to make room.
-        self.places = [Place::default(); 2];
         for origin in loaded.map_err(|fault| self.fail(fault))? {
             match origin {
                 Origin::Loaded => self.counters.cache_misses += 1,
@@ -303,7 +199,7 @@ impl SceneSource for PageSource<'_> {
     fn node(&mut self, index: NodeIndex, receivers: u8, upcoming: &impl Upcoming) -> Result<&NodeRecord, SourceError> {
         const BYTES: usize = size_of::<NodeRecord>();
         let slot = self.slot(PageKind::Node, index.0, receivers, upcoming)?;
-        let page = self.pages.cache.again(PageKind::Node);
+        let page = self.pages.cache.last(PageKind::Node);
         let start = slot as usize * BYTES;
         let bytes = page.get(start..start + BYTES).ok_or_else(|| lost(PageKind::Node))?;
         bytemuck::try_from_bytes(bytes).map_err(|_| lost(PageKind::Node))
@@ -322,8 +218,8 @@ impl SceneSource for PageSource<'_> {
             return Err(self.fail(Fault(FailureKind::Corrupt, format!("no points from {} on", first.0))));
         }
         let slot = self.slot(PageKind::Point, first.0, receivers, upcoming)?;
-        let count = count.min(self.places[PageKind::Point as usize].count - slot) as usize;
-        let page = self.pages.cache.again(PageKind::Point);
+        let count = count.min(self.scene.left(PageKind::Point, first.0, slot)) as usize;
+        let page = self.pages.cache.last(PageKind::Point);
         let start = slot as usize * BYTES;
         let bytes = page
             .get(start..start + count * BYTES)
@@ -333,8 +229,6 @@ impl SceneSource for PageSource<'_> {
 
     fn begin_pack(&mut self) {
         self.scene.begin_pack();
-        // The stamps are looked at when the page changes: have the next access look.
-        self.places = [Place::default(); 2];
     }
 }
 

@@ -7,12 +7,13 @@
 use crate::attach::CacheView;
 use crate::error::CacheError;
 use crate::frame::{FrameId, Tag};
-use crate::layout::KINDS;
+use crate::layout::{KINDS, PoolLayout};
 use lru::LruCache;
 use pbgi_core::{MountId, PageKey, PageKind};
 use std::hash::{BuildHasherDefault, Hasher};
+use std::num::NonZeroUsize;
 
-/// Entries of the front table, per pool: 12 KiB, which stay in the processor's nearest caches.
+/// Entries of the front table, per pool: 16 KiB, which stay in the processor's nearest caches.
 const FRONT: usize = 512;
 
 /// A worker's local cache over its [`CacheView`].
@@ -42,7 +43,7 @@ pub struct LocalCounters {
 impl LocalCache {
     /// An empty cache. Its capacities are the layout's `local_frames`.
     pub fn new(view: CacheView) -> Self {
-        let pools = KINDS.map(|kind| LocalPool::new(view.layout().pool(kind).local_frames as usize));
+        let pools = KINDS.map(|kind| LocalPool::new(view.layout().pool(kind)));
         Self {
             view,
             pools,
@@ -65,28 +66,24 @@ impl LocalCache {
         let tag = Tag::resident(key);
         let pool = &mut self.pools[key.kind as usize];
         let entry = &mut pool.front[front_index(tag)];
-        let frame = if entry.tag == tag {
+        if entry.tag == tag {
             pool.now += 1;
             entry.stamp = pool.now;
+            pool.last = entry.held;
             self.counters.local_hits += 1;
-            entry.frame
         } else {
-            self.find(key)?
-        };
-        // SAFETY: Rule 4: the frame is in the local cache, so its pin is held; pins are given up only by methods that
-        // borrow `self` exclusively, which the result's lifetime forbids.
-        let page = unsafe { self.view.frame(key.kind, frame) };
-        self.pools[key.kind as usize].last = Last { frame, page };
-        Some(page)
+            self.find(key)?;
+        }
+        Some(self.last(key.kind))
     }
 
-    /// The page of a kind that [`Self::get`] gave last, or nothing if it is no longer held. Costs two loads, and is not
-    /// counted: the page is the most recently used one already.
+    /// The page of a kind that [`Self::get`] gave last, or nothing if it is no longer held; it is not counted as a use.
     #[inline(always)]
-    pub fn again(&self, kind: PageKind) -> &[u8] {
-        let last = &self.pools[kind as usize].last;
-        // SAFETY: Rule 4, as in `get`: `release` forgets the page with its pin.
-        unsafe { &*last.page }
+    pub fn last(&self, kind: PageKind) -> &[u8] {
+        let pool = &self.pools[kind as usize];
+        // SAFETY: Rule 4: the frame is in the local cache, so its pin is held, or `release` would have forgotten it here;
+        // pins are given up only by methods that borrow `self` exclusively, which the result's lifetime forbids.
+        unsafe { pool.bytes(pool.last) }
     }
 
     /// The page, if it is in the local cache; it is not counted as a use.
@@ -94,13 +91,13 @@ impl LocalCache {
         let tag = Tag::resident(key);
         let pool = &self.pools[key.kind as usize];
         let entry = &pool.front[front_index(tag)];
-        let frame = if entry.tag == tag {
-            entry.frame
+        let held = if entry.tag == tag {
+            entry.held
         } else {
             *pool.lru.peek(&tag)?
         };
-        // SAFETY: Rule 4, as in `get`: the pin is held, and is given up by methods that borrow `self` exclusively.
-        Some(unsafe { self.view.frame(key.kind, frame) })
+        // SAFETY: Rule 4, as in `last`.
+        Some(unsafe { pool.bytes(held) })
     }
 
     /// Makes room for `count` pages of a kind (at most the capacity, so a request has no more either): **before** the
@@ -114,9 +111,9 @@ impl LocalCache {
             pool.replay();
         }
         while self.pools[kind as usize].lru.len() > keep
-            && let Some((tag, frame)) = self.pools[kind as usize].lru.pop_lru()
+            && let Some((tag, held)) = self.pools[kind as usize].lru.pop_lru()
         {
-            self.release(kind, tag, frame);
+            self.release(kind, tag, held);
         }
     }
 
@@ -132,24 +129,24 @@ impl LocalCache {
                 .filter(|tag| !keep(tag.mount()))
                 .collect();
             for tag in gone {
-                if let Some(frame) = self.pools[kind as usize].lru.pop(&tag) {
-                    self.release(kind, tag, frame);
+                if let Some(held) = self.pools[kind as usize].lru.pop(&tag) {
+                    self.release(kind, tag, held);
                 }
             }
         }
     }
 
     /// Unpins a frame that the LRU has let go of.
-    fn release(&mut self, kind: PageKind, tag: Tag, frame: FrameId) {
+    fn release(&mut self, kind: PageKind, tag: Tag, held: Held) {
         let pool = &mut self.pools[kind as usize];
         let entry = &mut pool.front[front_index(tag)];
         if entry.tag == tag {
             *entry = FrontEntry::EMPTY;
         }
-        if pool.last.frame == frame {
-            pool.last = Last::NONE;
+        if pool.last.frame == held.frame {
+            pool.last = Held::NONE;
         }
-        self.view.unpin(kind, frame);
+        self.view.unpin(kind, held.frame);
         self.counters.evictions += 1;
     }
 
@@ -206,15 +203,16 @@ impl LocalCache {
         &self.view
     }
 
-    /// Looks where the front table does not: in the LRU, then in the shared cache.
+    /// Looks where the front table does not: in the LRU, then in the shared cache. What is found is the last page.
     #[inline(never)]
-    fn find(&mut self, key: PageKey) -> Option<FrameId> {
+    fn find(&mut self, key: PageKey) -> Option<()> {
         let tag = Tag::resident(key);
         let pool = &mut self.pools[key.kind as usize];
-        if let Some(&frame) = pool.lru.peek(&tag) {
+        if let Some(&held) = pool.lru.peek(&tag) {
             self.counters.local_hits += 1;
-            pool.put_in_front(tag, frame);
-            return Some(frame);
+            pool.put_in_front(tag, held);
+            pool.last = held;
+            return Some(());
         }
         // Rule 10: room first, so that not even for a moment more is pinned than may be. A miss needs the room as well.
         self.reserve(key.kind, 1);
@@ -224,16 +222,21 @@ impl LocalCache {
         };
         self.counters.shared_hits += 1;
         self.counters.shared_hits_other_job += u64::from(self.view.job(key.kind, frame) != self.job);
-        self.insert(key.kind, tag, frame);
-        Some(frame)
+        self.pools[key.kind as usize].last = self.insert(key.kind, tag, frame);
+        Some(())
     }
 
-    fn insert(&mut self, kind: PageKind, tag: Tag, frame: FrameId) {
+    /// Takes a pinned frame into the LRU.
+    fn insert(&mut self, kind: PageKind, tag: Tag, frame: FrameId) -> Held {
         self.reserve(kind, 1);
+        // SAFETY: Rule 4: the frame is pinned. Its address outlives the slice, and is followed under the same rule.
+        let start = unsafe { self.view.frame(kind, frame) }.as_ptr();
+        let held = Held { frame, start };
         let pool = &mut self.pools[kind as usize];
         pool.replay();
-        pool.lru.push(tag, frame);
-        pool.put_in_front(tag, frame);
+        pool.lru.push(tag, held);
+        pool.put_in_front(tag, held);
+        held
     }
 }
 
@@ -245,29 +248,31 @@ impl Drop for LocalCache {
 
 #[derive(Debug)]
 struct LocalPool {
-    lru: LruCache<Tag, FrameId, BuildHasherDefault<TagHasher>>,
+    lru: LruCache<Tag, Held, BuildHasherDefault<TagHasher>>,
     front: Box<[FrontEntry; FRONT]>,
     /// Stamps of entries that lost their place in the front table, not yet replayed.
     displaced: Vec<(u64, Tag)>,
     now: u64,
     replayed: u64,
-    last: Last,
+    /// What was given out last, while it is held.
+    last: Held,
+    frame_bytes: usize,
 }
 
-/// What was given out last: the address, so that nothing has to be computed to give it again.
+/// A frame that this worker pins, and where it is, so that a hit computes nothing.
 #[derive(Clone, Copy, Debug)]
-struct Last {
+struct Held {
     frame: FrameId,
-    page: *const [u8],
+    start: *const u8,
 }
 
-// SAFETY: a number. It is followed only under Rule 4, whatever the thread.
-unsafe impl Send for Last {}
+// SAFETY: numbers. The address is followed only under Rule 4, on whatever thread.
+unsafe impl Send for Held {}
 
-impl Last {
+impl Held {
     const NONE: Self = Self {
         frame: FrameId(u32::MAX),
-        page: &[],
+        start: std::ptr::null(),
     };
 }
 
@@ -275,31 +280,46 @@ impl Last {
 struct FrontEntry {
     tag: Tag,
     stamp: u64,
-    frame: FrameId,
+    held: Held,
 }
 
 impl FrontEntry {
     const EMPTY: Self = Self {
         tag: Tag::EMPTY,
         stamp: 0,
-        frame: FrameId(0),
+        held: Held::NONE,
     };
 }
 
 impl LocalPool {
-    fn new(capacity: usize) -> Self {
-        let capacity = std::num::NonZeroUsize::new(capacity).unwrap_or(std::num::NonZeroUsize::MIN);
+    fn new(layout: &PoolLayout) -> Self {
+        let capacity = NonZeroUsize::new(layout.local_frames as usize).unwrap_or(NonZeroUsize::MIN);
         Self {
             lru: LruCache::with_hasher(capacity, BuildHasherDefault::default()),
             front: Box::new([FrontEntry::EMPTY; FRONT]),
             displaced: Vec::with_capacity(FRONT),
             now: 0,
             replayed: 0,
-            last: Last::NONE,
+            last: Held::NONE,
+            frame_bytes: layout.frame_bytes,
         }
     }
 
-    fn put_in_front(&mut self, tag: Tag, frame: FrameId) {
+    /// The bytes of a frame; none of [`Held::NONE`].
+    ///
+    /// # Safety
+    ///
+    /// The frame is pinned (Rule 4) as long as the result lives.
+    #[inline(always)]
+    unsafe fn bytes(&self, held: Held) -> &[u8] {
+        if held.start.is_null() {
+            return &[];
+        }
+        // SAFETY: Rules 4 and 9: the view gave the address out for a frame of this pool, which is `frame_bytes` long.
+        unsafe { std::slice::from_raw_parts(held.start, self.frame_bytes) }
+    }
+
+    fn put_in_front(&mut self, tag: Tag, held: Held) {
         let index = front_index(tag);
         let old = self.front[index];
         if old.stamp > self.replayed {
@@ -313,7 +333,7 @@ impl LocalPool {
         self.front[index] = FrontEntry {
             tag,
             stamp: self.now,
-            frame,
+            held,
         };
     }
 
