@@ -76,9 +76,6 @@ pub enum Report {
     },
 }
 
-/// Kinds of clouds that are one file, whose points follow from its content.
-const RESUMABLE: [&str; 4] = ["ply", "las", "laz", "ptc"];
-
 /// Time between two progress lines.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -189,20 +186,16 @@ fn build_scene(spec: &Spec) -> Result<Statistics, String> {
     })
 }
 
-/// A digest of everything that decides which points the input has; `None` where that is not known: meshes name further
-/// files.
+/// Names the build, so that it finds its runs when it is submitted again. What decides about its points beside these (the files
+/// that a mesh names) need not be here: points are compared before they are taken from runs.
 fn input_key(spec: &Spec) -> Option<u64> {
     // Keys without state: the same in the next process.
     let mut hasher = DefaultHasher::new();
-    for path in &spec.inputs {
-        let extension = path.extension()?.to_ascii_lowercase();
-        if !RESUMABLE.iter().any(|known| extension == *known) {
-            return None;
-        }
+    for path in spec.inputs.iter().chain(&spec.received) {
         let file = fs::metadata(path).ok()?;
         (path, file.len(), file.ino(), file.mtime(), file.mtime_nsec()).hash(&mut hasher);
     }
-    serde_json::to_string(&(&spec.cloud, env!("CARGO_PKG_VERSION")))
+    serde_json::to_string(&(&spec.cloud, &spec.density, env!("CARGO_PKG_VERSION")))
         .ok()?
         .hash(&mut hasher);
     Some(hasher.finish())

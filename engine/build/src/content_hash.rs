@@ -1,5 +1,5 @@
 //! [`ContentHash`]: the 128-bit identity of an octree, from the points in their order and everything else that decides
-//! its bytes.
+//! its bytes. [`UnorderedHash`]: whether two sets of points are the same.
 
 use pbgi_core::{BuildId, BuildSettings, PointRecord, Quantizer};
 
@@ -66,6 +66,25 @@ impl ContentHash {
     }
 }
 
+/// The same for the same points in any order. Against accident, not against forgery.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct UnorderedHash(pub u64);
+
+impl UnorderedHash {
+    /// Takes another point.
+    #[inline]
+    pub fn add(&mut self, point: &PointRecord) {
+        let [a, b, c, d]: [u64; 4] = bytemuck::cast(*point);
+        let mixed = fold(a ^ KEYS[0], b ^ KEYS[1]) ^ fold(c ^ KEYS[2], d ^ KEYS[3]).rotate_left(31);
+        self.0 = self.0.wrapping_add(fold(mixed ^ KEYS[4], KEYS[5]));
+    }
+
+    /// Takes the points of another.
+    pub fn merge(&mut self, other: Self) {
+        self.0 = self.0.wrapping_add(other.0);
+    }
+}
+
 /// Both halves of the product, folded.
 #[inline]
 fn fold(a: u64, b: u64) -> u64 {
@@ -78,6 +97,28 @@ mod tests {
     use super::*;
     use bytemuck::Zeroable;
     use std::collections::HashSet;
+
+    #[test]
+    fn every_bit_counts_and_the_order_does_not() {
+        let hash = |points: &[PointRecord]| {
+            let mut hash = UnorderedHash::default();
+            points.iter().for_each(|point| hash.add(point));
+            hash
+        };
+        let mut points = [PointRecord::zeroed(); 3];
+        points[0].radius = 1.0;
+        let mut seen = HashSet::from([hash(&points).0, hash(&points[..2]).0]);
+        for bit in 0..3 * 256 {
+            let mut flipped = points;
+            bytemuck::bytes_of_mut(&mut flipped)[bit / 8] ^= 1 << (bit % 8);
+            // The last two points are equal: what flips in one flips in the other to the same set.
+            assert!(seen.insert(hash(&flipped).0) != (bit >= 2 * 256), "bit {bit}");
+        }
+        assert_eq!(hash(&points), hash(&[points[1], points[2], points[0]]));
+        let mut parts = hash(&points[..1]);
+        parts.merge(hash(&points[1..]));
+        assert_eq!(hash(&points), parts);
+    }
 
     #[test]
     fn every_bit_the_order_and_the_settings_count() {

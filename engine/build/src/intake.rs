@@ -160,9 +160,8 @@ pub(crate) fn take_in<S: PointStream + ?Sized>(
         tally: Tally::default(),
         seconds: StageSeconds::default(),
         records_max,
-        resumed: 0,
     };
-    pass.run(stream, sorter, watcher)?;
+    pass.read(stream, sorter, watcher)?;
     if !pass.keeps {
         let measured = pass.tally.bounds;
         pass = Pass {
@@ -173,7 +172,7 @@ pub(crate) fn take_in<S: PointStream + ?Sized>(
             ..pass
         };
         stream.rewind().map_err(BuildError::Input)?;
-        pass.run(stream, sorter, watcher)?;
+        pass.read(stream, sorter, watcher)?;
     }
     Ok(Intake {
         quantizer: pass.quantizer.or_else(|| lattice(&pass.tally.bounds)),
@@ -196,8 +195,6 @@ struct Pass {
     tally: Tally,
     seconds: StageSeconds,
     records_max: u64,
-    /// Points to come that are in runs already: they are looked at again, and not kept.
-    resumed: u64,
 }
 
 /// A batch that has been looked at.
@@ -228,7 +225,8 @@ fn look(questions: &Mutex<Receiver<Question>>, declared: Option<&Bounds>) {
 }
 
 impl Pass {
-    fn run<S: PointStream + ?Sized>(
+    /// Reads to the end of the input; once more from its start, should runs that were left be those of another.
+    fn read<S: PointStream + ?Sized>(
         &mut self,
         stream: &mut S,
         sorter: &mut Sorter,
@@ -237,8 +235,23 @@ impl Pass {
         if let Some(quantizer) = &self.quantizer
             && !sorter.fits_core()
         {
-            self.resumed = sorter.resume(quantizer)?;
+            sorter.resume(quantizer)?;
         }
+        while self.run(stream, sorter, watcher)?.is_break() {
+            sorter.forget()?;
+            self.tally = Tally::default();
+            stream.rewind().map_err(BuildError::Input)?;
+        }
+        Ok(())
+    }
+
+    /// Reads to the end of the input, or breaks off where its points are not those of the runs that were left.
+    fn run<S: PointStream + ?Sized>(
+        &mut self,
+        stream: &mut S,
+        sorter: &mut Sorter,
+        watcher: &mut Watcher<'_>,
+    ) -> Result<ControlFlow<()>, BuildError<S::Error>> {
         let total = stream.len_hint();
         let threads = sorter.threads();
         let declared = self.declared;
@@ -274,11 +287,17 @@ impl Pass {
                 // What was read before the end is told first.
                 let Some(next) = asked.pop_front() else {
                     end.unwrap_or(Ok(())).map_err(BuildError::Input)?;
-                    return self.tally.check().map_err(BuildError::widen);
+                    self.tally.check().map_err(BuildError::widen)?;
+                    return Ok(match sorter.knows_no_more() {
+                        true => ControlFlow::Continue(()),
+                        false => ControlFlow::Break(()),
+                    });
                 };
                 if let Ok(Looked { mut points, tally }) = next.recv() {
-                    self.take(&points, &tally, total, sorter, watcher)
-                        .map_err(BuildError::widen)?;
+                    let taken = self.take(&points, &tally, total, sorter, watcher);
+                    if taken.map_err(BuildError::widen)?.is_break() {
+                        return Ok(ControlFlow::Break(()));
+                    }
                     points.clear();
                     spare.push(points);
                 }
@@ -296,7 +315,7 @@ impl Pass {
         total: Option<u64>,
         sorter: &mut Sorter,
         watcher: &mut Watcher<'_>,
-    ) -> Result<(), BuildError> {
+    ) -> Result<ControlFlow<()>, BuildError> {
         self.tally.merge(tally);
         if self.tally.points > self.records_max {
             return Err(BuildError::Limit {
@@ -304,9 +323,9 @@ impl Pass {
                 max: self.records_max,
             });
         }
-        let known = self.resumed.min(points.len() as u64);
-        self.resumed -= known;
-        let mut points = &points[known as usize..];
+        let Some(mut points) = sorter.skip_known(points) else {
+            return Ok(ControlFlow::Break(()));
+        };
         while self.keeps && !points.is_empty() {
             if sorter.buffer().room() == 0 {
                 self.make_room(total, sorter, watcher)?;
@@ -316,7 +335,7 @@ impl Pass {
             sorter.buffer().extend(head);
             points = tail;
         }
-        Ok(())
+        Ok(ControlFlow::Continue(()))
     }
 
     #[cold]

@@ -18,8 +18,8 @@ pub struct BuildRequest {
     pub memory_bytes: u64,
     /// Shape and layout of the octree.
     pub settings: BuildSettings,
-    /// What the input is, where the caller can tell: requests with the same value read the same points in the same order.
-    /// The runs of a build that is killed then wait in `scratch_dir`, and the next one with this value goes on from them.
+    /// Names the input, where the caller can: the runs of a build that is killed then wait in `scratch_dir`, and the next one
+    /// with this value goes on from them, if it reads the same points in the same order, which is checked.
     pub input_key: Option<u64>,
 }
 

@@ -32,9 +32,10 @@ pub(crate) fn is_run_name(name: &OsStr) -> bool {
         .is_some_and(|digits| digits.len() >= DIGITS && digits.iter().all(u8::is_ascii_digit))
 }
 
-/// Whether a file in a scratch folder is a seal.
-pub(crate) fn is_seal_name(name: &OsStr) -> bool {
-    is_run_name(name) && name.as_bytes().ends_with(SEAL_SUFFIX.as_bytes())
+/// Number of the run whose seal a file in a scratch folder is.
+pub(crate) fn sealed_number(name: &OsStr) -> Option<u64> {
+    let name = name.to_str().filter(|name| is_run_name(name.as_ref()))?;
+    name.strip_suffix(SEAL_SUFFIX)?.strip_prefix(PREFIX)?.parse().ok()
 }
 
 fn run_path(scratch: &Path, number: u64) -> PathBuf {
@@ -49,6 +50,7 @@ fn seal_path(run: &Path) -> PathBuf {
 
 /// A finished run. Dropping it deletes the file.
 pub struct Run {
+    number: u64,
     file: DataFile,
     volume: Arc<dyn Volume>,
     records: u64,
@@ -67,6 +69,7 @@ impl Run {
         seal.read_at(0, &mut bytes, &|| "seal".to_owned()).ok()?;
         let (records, note, checksums) = decode_seal(&bytes)?;
         let run = Self {
+            number,
             file: DataFile::open(scratch.volume(), &path).ok()?,
             volume: scratch.volume().clone(),
             records,
@@ -96,6 +99,11 @@ impl Run {
         self.sealed = true;
         let file = DataFile::create_new(&self.volume, &path)?;
         file.write_at(0, &encode_seal(self.records, note, &self.checksums))
+    }
+
+    /// Its number in its folder.
+    pub fn number(&self) -> u64 {
+        self.number
     }
 
     /// Points in it.
@@ -158,6 +166,7 @@ impl RunWriter {
     pub fn create(scratch: &ScratchDir, number: u64) -> Result<Self, StoreError> {
         let path = run_path(scratch.path(), number);
         let run = Run {
+            number,
             file: DataFile::create_new(scratch.volume(), &path)?,
             volume: scratch.volume().clone(),
             records: 0,

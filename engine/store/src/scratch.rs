@@ -3,7 +3,7 @@
 use crate::data_file::write_error;
 use crate::error::StoreError;
 use crate::limits::{RUNS_KEPT, SCRATCH_MODE};
-use crate::run::{Run, is_run_name, is_seal_name};
+use crate::run::{Run, is_run_name, sealed_number};
 use crate::temporary::{create_locked, is_suffix, remove_files, remove_folder, unique_suffix};
 use crate::volume::{EntryKind, Lock, Volume};
 use std::ffi::OsStr;
@@ -66,12 +66,16 @@ impl ScratchDir {
         }
     }
 
-    /// The sealed runs in it, numbered from 0 without a gap, each with what its writer noted. Every other file goes.
+    /// The sealed runs in it by number, each with what its writer noted. Every other file goes.
     ///
     /// # Errors
-    /// [`StoreError::Io`] if the folder cannot be cleaned.
+    /// [`StoreError::Io`] if the folder cannot be read or cleaned.
     pub fn sealed_runs(&self) -> Result<Vec<(Run, Vec<u8>)>, StoreError> {
-        let runs: Vec<_> = (0..).map_while(|number| Run::reopen(self, number)).collect();
+        let entries = self.volume.list(&self.path);
+        let entries = entries.map_err(|error| StoreError::io("list folder", &self.path, error))?;
+        let numbers = entries.iter().filter_map(|entry| sealed_number(&entry.name));
+        let mut runs: Vec<_> = numbers.filter_map(|number| Run::reopen(self, number)).collect();
+        runs.sort_unstable_by_key(|(run, _)| run.number());
         let keep: Vec<_> = runs.iter().flat_map(|(run, _)| run.names()).collect();
         let other = |name: &OsStr| is_run_name(name) && !keep.contains(&self.path.join(name));
         let cleaned = remove_files(self.volume.as_ref(), &self.path, &other);
@@ -145,7 +149,12 @@ pub fn sweep_scratch(volume: &dyn Volume, parent: &Path) -> Result<Sweep, StoreE
 }
 
 fn is_resumable(volume: &dyn Volume, path: &Path) -> bool {
-    let sealed = || Ok(volume.list(path)?.iter().any(|entry| is_seal_name(&entry.name)));
+    let sealed = || {
+        Ok(volume
+            .list(path)?
+            .iter()
+            .any(|entry| sealed_number(&entry.name).is_some()))
+    };
     let young = || Ok(volume.age(path)? < RUNS_KEPT);
     let holds = |answer: io::Result<bool>| answer.unwrap_or(false);
     holds(sealed()) && holds(young())

@@ -3,6 +3,7 @@
 
 pub mod buffer;
 pub mod merge;
+mod resume;
 pub mod sorter;
 
 use crate::error::BuildError;

@@ -1,10 +1,12 @@
 //! [`Sorter`]: takes points in any order and gives them back sorted, through scratch where memory does not hold them.
 
 use crate::budget::Budget;
+use crate::content_hash::UnorderedHash;
 use crate::error::BuildError;
 use crate::limits::{BATCH_POINTS, LEN_HINT_TRUST};
 use crate::sort::buffer::PointBuffer;
 use crate::sort::merge::Merge;
+use crate::sort::resume::{Content, Known, Span, without_gaps};
 use pbgi_core::{PointRecord, Quantizer};
 use pbgi_store::{Run, RunWriter, ScratchDir, StoreError, Volume};
 use std::path::{Path, PathBuf};
@@ -16,7 +18,7 @@ use std::time::Instant;
 pub struct Sorter {
     buffer: PointBuffer,
     spilling: Spilling,
-    runs: Vec<Run>,
+    runs: Vec<Span>,
     // Dropped after the runs in it.
     scratch: Option<Arc<ScratchDir>>,
     volume: Arc<dyn Volume>,
@@ -27,7 +29,8 @@ pub struct Sorter {
     /// Names the scratch folder, where runs may outlive this process.
     input_key: Option<u64>,
     /// Points at the start of the input that are in runs already.
-    resumed: u64,
+    known: Known,
+    next_run: u64,
     traffic: Traffic,
 }
 
@@ -36,7 +39,7 @@ pub struct Sorter {
 struct Spilling(Option<JoinHandle<Result<Spilled, StoreError>>>);
 
 struct Spilled {
-    run: Run,
+    span: Span,
     /// Emptied.
     buffer: PointBuffer,
     seconds: f64,
@@ -100,7 +103,8 @@ impl Sorter {
             budget,
             expected: 0,
             input_key,
-            resumed: 0,
+            known: Known::default(),
+            next_run: 0,
             traffic: Traffic::default(),
         }
     }
@@ -119,22 +123,45 @@ impl Sorter {
         self.expected <= self.budget.core_points as u64
     }
 
-    /// Takes over the runs that a killed build of the same input left, if they were sorted by the same lattice; returns how
-    /// many points they hold: the first ones of the input.
+    /// Takes over the runs that a killed build of this input left, if they were sorted by the same lattice. The points in
+    /// them are to come all the same, and are to be given to [`Self::skip_known`].
     ///
     /// # Errors
     /// Those of scratch.
-    pub fn resume(&mut self, quantizer: &Quantizer) -> Result<u64, StoreError> {
-        let Some(key) = self.input_key else { return Ok(0) };
+    pub fn resume(&mut self, quantizer: &Quantizer) -> Result<(), StoreError> {
+        let (Some(key), None) = (self.input_key, &self.scratch) else {
+            return Ok(());
+        };
         let scratch = ScratchDir::create_or_adopt(&self.volume, &self.scratch_dir, key)?;
-        let note = note(quantizer);
-        let runs = scratch.sealed_runs()?.into_iter();
-        self.runs = runs.map_while(|(run, its)| (its == note).then_some(run)).collect();
+        let found = scratch.sealed_runs()?;
+        self.next_run = found.last().map_or(0, |(run, _)| run.number() + 1);
+        self.runs = without_gaps(found, quantizer);
         self.scratch = Some(Arc::new(scratch));
         self.traffic.runs = self.runs.len() as u64;
         self.traffic.runs_resumed = self.traffic.runs;
-        self.resumed = self.runs.iter().map(Run::records).sum();
-        Ok(self.resumed)
+        self.known = Known::new(&self.runs);
+        Ok(())
+    }
+
+    /// Takes the points that are in runs already off the next ones of the input; `None` if the input has others at its start:
+    /// then [`Self::forget`] is called, and the input given again.
+    pub(crate) fn skip_known<'a>(&mut self, points: &'a [PointRecord]) -> Option<&'a [PointRecord]> {
+        self.known.skip(points).ok()
+    }
+
+    /// Whether all points that are in runs came again, which they must have by the end of the input.
+    pub(crate) fn knows_no_more(&self) -> bool {
+        self.known.end().is_ok()
+    }
+
+    /// Gives up everything: the input is another than that of the runs.
+    pub(crate) fn forget(&mut self) -> Result<(), StoreError> {
+        self.settle()?;
+        self.buffer.clear();
+        self.runs.clear();
+        self.known = Known::default();
+        self.traffic = Traffic::default();
+        Ok(())
     }
 
     /// Threads to work with.
@@ -163,7 +190,7 @@ impl Sorter {
             Some(scratch) => scratch,
             none => none.insert(Arc::new(ScratchDir::create(&self.volume, &self.scratch_dir)?)),
         };
-        let spilled: u64 = self.runs.iter().map(Run::records).sum();
+        let spilled: u64 = self.runs.iter().map(|span| span.run.records()).sum();
         let left = self.expected.saturating_sub(spilled).max(self.buffer.len() as u64);
         let needed = left.saturating_mul(size_of::<PointRecord>() as u64);
         check_room(scratch.free_bytes()?, needed, scratch.path())?;
@@ -172,10 +199,9 @@ impl Sorter {
         let next = spare.unwrap_or_else(|| PointBuffer::new(self.budget.run_points));
         let full = std::mem::replace(&mut self.buffer, next);
         let (scratch, quantizer, threads) = (scratch.clone(), *quantizer, self.threads());
-        let number = self.traffic.runs;
-        self.traffic.runs += 1;
-        let seal = self.input_key.map(|_| note(&quantizer));
-        let spill = move || write_run(&scratch, number, full, &quantizer, threads, seal.as_deref());
+        let number = self.number();
+        let sealed = self.input_key.is_some();
+        let spill = move || write_run(&scratch, number, full, spilled, &quantizer, threads, sealed);
         let thread = Builder::new().name("pbgi-sort".to_owned()).spawn(spill);
         self.spilling.0 = Some(thread.map_err(BuildError::Thread)?);
         if oversized {
@@ -184,14 +210,22 @@ impl Sorter {
         Ok(())
     }
 
+    /// The number of another run.
+    fn number(&mut self) -> u64 {
+        let number = self.next_run;
+        self.next_run += 1;
+        self.traffic.runs += 1;
+        number
+    }
+
     /// Waits for the run that is being made; returns its memory.
     fn settle(&mut self) -> Result<Option<PointBuffer>, StoreError> {
-        let Some(Spilled { run, buffer, seconds }) = self.spilling.wait()? else {
+        let Some(Spilled { span, buffer, seconds }) = self.spilling.wait()? else {
             return Ok(None);
         };
-        self.traffic.bytes_written += run.bytes();
+        self.traffic.bytes_written += span.run.bytes();
         self.traffic.spill_seconds += seconds;
-        self.runs.push(run);
+        self.runs.push(span);
         Ok((buffer.capacity() <= self.budget.run_points).then_some(buffer))
     }
 
@@ -216,97 +250,91 @@ impl Sorter {
             return Ok((SortResult::Memory(self.buffer), self.traffic));
         };
         // The merges need the memory.
-        drop(self.buffer);
+        self.buffer = PointBuffer::new(0);
         while self.runs.len() > self.budget.fan_in {
-            let mut longer = Vec::new();
-            let mut group = Vec::new();
-            let mut runs = std::mem::take(&mut self.runs).into_iter().peekable();
-            while let Some(run) = runs.next() {
-                group.push(run);
-                if group.len() == self.budget.fan_in || runs.peek().is_none() {
-                    let group = std::mem::take(&mut group);
-                    longer.push(merge_group(
-                        group,
-                        &scratch,
-                        quantizer,
-                        &self.budget,
-                        &mut self.traffic,
-                        watch,
-                    )?);
-                }
+            let mut shorter = std::mem::take(&mut self.runs).into_iter();
+            while shorter.len() > 0 {
+                let group: Vec<Span> = shorter.by_ref().take(self.budget.fan_in).collect();
+                let merged = self.merge(group, &scratch, quantizer, watch)?;
+                self.runs.push(merged);
             }
-            self.runs = longer;
         }
-        self.traffic.bytes_read += self.runs.iter().map(Run::bytes).sum::<u64>();
-        Ok((SortResult::Runs(self.runs, scratch), self.traffic))
+        self.traffic.bytes_read += self.runs.iter().map(|span| span.run.bytes()).sum::<u64>();
+        let runs = self.runs.into_iter().map(|span| span.run).collect();
+        Ok((SortResult::Runs(runs, scratch), self.traffic))
+    }
+
+    /// Merges consecutive runs into one. They go when it is sealed.
+    fn merge(
+        &mut self,
+        mut group: Vec<Span>,
+        scratch: &ScratchDir,
+        quantizer: &Quantizer,
+        watch: Watch<'_>,
+    ) -> Result<Span, BuildError> {
+        if group.len() == 1
+            && let Some(span) = group.pop()
+        {
+            return Ok(span);
+        }
+        let bytes = group.iter().map(|span| span.run.bytes()).sum();
+        check_room(scratch.free_bytes()?, bytes, scratch.path())?;
+        let mut content = Content {
+            first: group.iter().map(|span| span.content.first).min().unwrap_or_default(),
+            hash: UnorderedHash::default(),
+        };
+        group.iter().for_each(|span| content.hash.merge(span.content.hash));
+        let blocks = self.budget.blocks_per_read(group.len() + 1);
+        let mut merge = Merge::new(group.into_iter().map(|span| span.run).collect(), blocks, *quantizer)?;
+        let mut writer = RunWriter::create(scratch, self.number())?;
+        let mut done = 0u64;
+        while let Some((_, point)) = merge.next_point()? {
+            writer.push(point)?;
+            done += 1;
+            if done.is_multiple_of(BATCH_POINTS as u64) {
+                watch(done)?;
+            }
+        }
+        self.traffic.bytes_read += bytes;
+        self.traffic.bytes_written += bytes;
+        let run = match self.input_key {
+            Some(_) => writer.finish_sealed(&content.to_note(quantizer))?,
+            None => writer.finish()?,
+        };
+        Ok(Span { run, content })
     }
 }
 
-/// What a seal says of the order of its run.
-fn note(quantizer: &Quantizer) -> Vec<u8> {
-    let [x, y, z] = quantizer.origin;
-    [x, y, z, quantizer.edge].map(f64::to_le_bytes).concat()
-}
-
-/// Sorts a buffer and writes it as run `number`.
+/// Sorts a buffer, whose first point is number `first` of the input, and writes it as run `number`.
 fn write_run(
     scratch: &ScratchDir,
     number: u64,
     mut buffer: PointBuffer,
+    first: u64,
     quantizer: &Quantizer,
     threads: usize,
-    seal: Option<&[u8]>,
+    sealed: bool,
 ) -> Result<Spilled, StoreError> {
     let started = Instant::now();
     let order = buffer.sorted(quantizer, threads);
     let mut writer = RunWriter::create(scratch, number)?;
+    let mut hash = UnorderedHash::default();
     for point in order.iter(&buffer) {
+        hash.add(&point);
         writer.push(point)?;
     }
-    let run = match seal {
-        Some(note) => writer.finish_sealed(note)?,
-        None => writer.finish()?,
+    let content = Content { first, hash };
+    let run = if sealed {
+        writer.finish_sealed(&content.to_note(quantizer))?
+    } else {
+        writer.finish()?
     };
     buffer.clear();
     Ok(Spilled {
-        run,
+        span: Span { run, content },
         buffer,
         seconds: started.elapsed().as_secs_f64(),
     })
-}
-
-/// Merges consecutive runs into one.
-fn merge_group(
-    group: Vec<Run>,
-    scratch: &ScratchDir,
-    quantizer: &Quantizer,
-    budget: &Budget,
-    traffic: &mut Traffic,
-    watch: Watch<'_>,
-) -> Result<Run, BuildError> {
-    let mut group = group;
-    if group.len() == 1
-        && let Some(run) = group.pop()
-    {
-        return Ok(run);
-    }
-    let bytes = group.iter().map(Run::bytes).sum();
-    check_room(scratch.free_bytes()?, bytes, scratch.path())?;
-    let blocks = budget.blocks_per_read(group.len() + 1);
-    let mut merge = Merge::new(group, blocks, *quantizer)?;
-    let mut writer = RunWriter::create(scratch, traffic.runs)?;
-    let mut done = 0u64;
-    while let Some((_, point)) = merge.next_point()? {
-        writer.push(point)?;
-        done += 1;
-        if done.is_multiple_of(BATCH_POINTS as u64) {
-            watch(done)?;
-        }
-    }
-    traffic.runs += 1;
-    traffic.bytes_read += bytes;
-    traffic.bytes_written += bytes;
-    Ok(writer.finish()?)
 }
 
 /// Refuses what obviously does not fit, before anything is written.

@@ -3,7 +3,8 @@
 
 use crate::support::{Cloud, Place, Tree, build_cloud, sheet, small_pages};
 use nix::errno::Errno;
-use pbgi_build::{BuildError, BuildHost};
+use pbgi_build::{BuildError, BuildHost, BuildReport};
+use pbgi_core::point::Sides;
 use pbgi_store::testsuite::{CrashImage, CrashVolume, FaultPlan, FaultScope, FaultVolume};
 use pbgi_store::{OsVolume, Overwrite, StoreError, Volume, sweep_scratch, sweep_temporaries};
 use std::ops::ControlFlow;
@@ -260,13 +261,9 @@ fn killed_build_child() {
         }
         ControlFlow::Continue(())
     };
-    let mut host = busy_host(&place.volume);
+    let host = busy_host(&place.volume);
     let mut request = place.request(small_pages());
-    if let Ok(key) = std::env::var(ABORT_KEY) {
-        // One merge of all runs: intermediate merges use them up.
-        host.fan_in_max = usize::MAX;
-        request.input_key = Some(key.parse().unwrap());
-    }
+    request.input_key = std::env::var(ABORT_KEY).ok().map(|key| key.parse().unwrap());
     pbgi_build::build_on(&mut cloud(), &request, &host, &mut observer).unwrap();
 }
 
@@ -284,13 +281,33 @@ fn killed_at(at: u32, place: &Place, key: Option<u64>) -> bool {
     !command.status().unwrap().success()
 }
 
+/// Builds where a process was killed at `at`; the report and the pages.
+fn build_again(cloud: &Cloud, place: &Place, key: u64) -> (BuildReport, [Vec<u8>; 2]) {
+    let mut request = place.request(small_pages());
+    request.input_key = Some(key);
+    let host = busy_host(&place.volume);
+    let watch = &mut |_| ControlFlow::Continue(());
+    let report = pbgi_build::build_on(&mut cloud.clone(), &request, &host, watch).unwrap();
+    Tree::audit(&place.open().unwrap(), &cloud.points);
+    assert!(place.leftovers(&OsVolume).is_empty());
+    (report, pages(place))
+}
+
+fn pages(place: &Place) -> [Vec<u8>; 2] {
+    ["nodes.pages", "points.pages"].map(|name| std::fs::read(place.output().join(name)).unwrap())
+}
+
+/// The pages of a build that nobody disturbs, and the runs that it makes, merged ones included.
+fn undisturbed(cloud: &Cloud) -> (u64, [Vec<u8>; 2]) {
+    let place = Place::on_disk();
+    let report = build_cloud(cloud, &place, &busy_host(&place.volume), small_pages()).unwrap();
+    (report.runs, pages(&place))
+}
+
 #[test]
 fn a_killed_build_goes_on_from_its_finished_runs_to_the_same_bytes() {
-    let bytes =
-        |place: &Place| ["nodes.pages", "points.pages"].map(|name| std::fs::read(place.output().join(name)).unwrap());
-    let undisturbed = Place::on_disk();
-    build_cloud(&cloud(), &undisturbed, &busy_host(&undisturbed.volume), small_pages()).unwrap();
-    let (mut kills, mut resumed) = (0, 0);
+    let (runs, expected) = undisturbed(&cloud());
+    let (mut kills, mut resumed, mut saved) = (0, 0, 0);
     for at in 1.. {
         let place = Place::on_disk();
         if !killed_at(at, &place, Some(7)) {
@@ -299,23 +316,55 @@ fn a_killed_build_goes_on_from_its_finished_runs_to_the_same_bytes() {
         kills += 1;
         let swept = sweep_scratch(&OsVolume, &place.scratch()).unwrap();
         sweep_temporaries(&OsVolume, &place.output()).unwrap();
-        let mut host = busy_host(&place.volume);
-        host.fan_in_max = usize::MAX;
-        let mut request = place.request(small_pages());
         // Another input gets nothing of it.
+        let mut request = place.request(small_pages());
         request.input_key = Some(8);
+        let host = busy_host(&place.volume);
         let other = pbgi_build::build_on(&mut cloud(), &request, &host, &mut |_| ControlFlow::Continue(())).unwrap();
         assert_eq!(other.runs_resumed, 0, "killed at {at}");
-        request.input_key = Some(7);
-        let report = pbgi_build::build_on(&mut cloud(), &request, &host, &mut |_| ControlFlow::Continue(())).unwrap();
-        assert_eq!(report.runs, 5);
+        let (report, bytes) = build_again(&cloud(), &place, 7);
         assert_eq!(report.runs_resumed > 0, swept.kept > 0, "killed at {at}");
         resumed += report.runs_resumed;
-        assert!(bytes(&place) == bytes(&undisturbed), "killed at {at}");
-        Tree::audit(&place.open().unwrap(), &cloud().points);
-        assert!(place.leftovers(&OsVolume).is_empty(), "killed at {at}");
+        // Runs that were merged are not made again.
+        saved += runs - (report.runs - report.runs_resumed);
+        assert!(bytes == expected, "killed at {at}");
     }
-    assert!(kills >= 5 && resumed >= 10, "{kills} kills, {resumed} runs resumed");
+    assert!(
+        kills >= 5 && resumed >= 10 && saved > resumed,
+        "{kills} kills, {resumed} runs resumed, {saved} not made again"
+    );
+}
+
+#[test]
+fn runs_of_an_input_that_has_changed_since_are_not_used() {
+    let mut shorter = cloud().points.to_vec();
+    shorter.truncate(shorter.len() / 2);
+    let mut brighter = cloud().points.to_vec();
+    let middle = brighter.len() / 2;
+    brighter[middle] = brighter[middle].with_sides(Sides {
+        front: [9.0; 3],
+        back: [0.0; 3],
+    });
+    let bounds = cloud().bounds;
+    let changed = [shorter, brighter].map(|points| {
+        let mut changed = Cloud::new(points);
+        changed.bounds = bounds;
+        (undisturbed(&changed).1, changed)
+    });
+    let mut tried = 0;
+    for at in 1.. {
+        let place = Place::on_disk();
+        if !killed_at(at, &place, Some(7)) {
+            break;
+        }
+        let swept = sweep_scratch(&OsVolume, &place.scratch()).unwrap();
+        sweep_temporaries(&OsVolume, &place.output()).unwrap();
+        tried += swept.kept;
+        let (expected, changed) = &changed[at as usize % 2];
+        let (_, bytes) = build_again(changed, &place, 7);
+        assert!(bytes == *expected, "killed at {at}");
+    }
+    assert!(tried >= 4, "{tried} folders with runs");
 }
 
 #[test]
