@@ -5,8 +5,8 @@ use crate::morton::Quantizer;
 use crate::node::NodeAttributes;
 use crate::pack::pack_harmonics;
 use crate::point::PointRecord;
-use crate::section::{section_area, voxel_half_spaces};
-use crate::sh::{SH_TERMS, project_cosine};
+use crate::section::voxel_section_area;
+use crate::sh::{SH_TERMS, band, project_cosine};
 use crate::voxel::Voxel;
 use glam::{DMat3, DVec3, Vec3};
 
@@ -78,13 +78,14 @@ impl ClusterAccumulator {
         // Not `point.area()`: the square of a radius that a single holds may be one that it does not.
         let area = std::f64::consts::PI * radius * radius;
         let sides = point.sides();
-        let front = project_cosine(normal);
-        let back = project_cosine(-normal);
-        for (term, (f, b)) in self.sh.iter_mut().zip(front.iter().zip(&back)) {
-            let (f, b) = (f64::from(*f), f64::from(*b));
-            term[0] += area * f;
-            for channel in 0..3 {
-                term[channel + 1] += area * (f * f64::from(sides.front[channel]) + b * f64::from(sides.back[channel]));
+        let [front, back] = [sides.front, sides.back].map(|side| DVec3::from_array(side.map(f64::from)));
+        // The back's cosine is the front's mirrored: terms of even bands stay, those of odd ones change their sign. Area is
+        // seen from the front only.
+        let power = |radiance: DVec3| [area, area * radiance.x, area * radiance.y, area * radiance.z];
+        let bands = [power(front + back), power(front - back), power(front + back)];
+        for (index, (sums, term)) in self.sh.iter_mut().zip(project_cosine(normal)).enumerate() {
+            for (sum, power) in sums.iter_mut().zip(bands[band(index)]) {
+                *sum += f64::from(term) * power;
             }
         }
         let position = DVec3::from_array(point.position.map(f64::from)) - DVec3::from_array(quantizer.origin);
@@ -100,8 +101,7 @@ impl ClusterAccumulator {
             self.second_moment[i] += area * (outer_position[i] + spread * (identity - outer_normal[i]));
             self.normal_moment[i] += area * outer_normal[i];
         }
-        for (sums, side) in self.light.iter_mut().zip([sides.front, sides.back]) {
-            let radiance = DVec3::from_array(side.map(f64::from));
+        for (sums, radiance) in self.light.iter_mut().zip([front, back]) {
             sums.first += radiance * area;
             sums.second += area * radiance.length_squared();
         }
@@ -152,7 +152,7 @@ impl ClusterAccumulator {
         let aligned = quadratic_form(&self.normal_moment, axis) / self.area;
         let origin = DVec3::from_array(quantizer.origin);
         let center = DVec3::from_array(voxel.min_corner(quantizer)) - origin + edge / 2.0;
-        let section = section_area(mean, axis, 2.0 * edge, &voxel_half_spaces(center, edge / 2.0, axis));
+        let section = voxel_section_area(mean, axis, center, edge / 2.0);
         let (sh, clamped) = pack_harmonics(&self.sh, edge);
         let attributes = NodeAttributes {
             centroid: (mean + origin).as_vec3(),
@@ -190,11 +190,17 @@ impl ClusterAccumulator {
     fn axis(&self) -> DVec3 {
         // The sixteenth power: a flat cluster has converged to machine precision; a round one has no axis to converge to.
         const SQUARINGS: usize = 4;
+        const RANK_ONE: f64 = 1e-12;
         let [xx, yy, zz, xy, xz, yz] = self.normal_moment;
         let mut power = DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz));
         for _ in 0..SQUARINGS {
             // The trace of a second moment is not zero, and stays above a third of its square when that is taken.
             power *= 1.0 / (power.x_axis.x + power.y_axis.y + power.z_axis.z);
+            // The squares of all entries are those of the eigenvalues, whose sum is one: of a flat cluster there is but one.
+            let [x, y, z] = [power.x_axis, power.y_axis, power.z_axis].map(DVec3::length_squared);
+            if x + y + z > 1.0 - RANK_ONE {
+                break;
+            }
             power *= power;
         }
         // The columns of a matrix of rank one are multiples of the axis; the longest is the most exact.

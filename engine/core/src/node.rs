@@ -7,6 +7,7 @@ use crate::sh::SH_TERMS;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use half::f16;
+use half::slice::HalfFloatSliceExt;
 use std::sync::LazyLock;
 
 /// One octree node with its cluster.
@@ -122,6 +123,8 @@ impl NodeRecord {
         let radius_code = (attributes.radius_ratio.log2() * RADIUS_STEPS + RADIUS_ONE)
             .ceil()
             .clamp(0.0, 255.0) as u8;
+        let mut covariance = [f16::ZERO; 6];
+        covariance.convert_from_f32_slice(&attributes.covariance);
         Self {
             centroid: attributes.centroid.to_array(),
             first,
@@ -131,7 +134,7 @@ impl NodeRecord {
             radius_code,
             spread_code: (attributes.spread.clamp(0.0, 1.0) * SHARE_STEPS).round() as u8,
             fill_code: (attributes.fill * FILL_STEPS).round().clamp(0.0, 255.0) as u8,
-            covariance: attributes.covariance.map(f16::from_f32),
+            covariance,
             sh: attributes.sh,
             variation_code: (attributes.variation * SHARE_STEPS).ceil() as u8,
             zero: [0; 3],

@@ -6,6 +6,7 @@
 use crate::limits::HALF_MAX;
 use crate::sh::SH_TERMS;
 use half::f16;
+use half::slice::HalfFloatSliceExt;
 use std::f32::consts::PI;
 
 /// Area of a disc as wide as the diagonal of a voxel with this edge: `0.75 pi edge^2` (paper section 6).
@@ -19,13 +20,14 @@ pub fn pack_harmonics(sh: &[[f64; 4]; SH_TERMS], voxel_edge: f64) -> ([[f16; 4];
     let scale = 1.0 / (0.75 * std::f64::consts::PI * voxel_edge * voxel_edge);
     let limit = f64::from(HALF_MAX);
     let mut clamped = 0;
-    let packed = sh.map(|term| {
-        term.map(|value| {
-            let scaled = value * scale;
-            clamped += u32::from(scaled.abs() > limit);
-            f16::from_f64(scaled.clamp(-limit, limit))
-        })
-    });
+    let mut scaled = [0.0; 4 * SH_TERMS];
+    for (scaled, value) in scaled.iter_mut().zip(sh.as_flattened()) {
+        let value = value * scale;
+        clamped += u32::from(value.abs() > limit);
+        *scaled = value.clamp(-limit, limit) as f32;
+    }
+    let mut packed = [[f16::ZERO; 4]; SH_TERMS];
+    packed.as_flattened_mut().convert_from_f32_slice(&scaled);
     (packed, clamped)
 }
 

@@ -9,6 +9,16 @@ use std::f32::consts::PI;
 /// Terms of three bands.
 pub const SH_TERMS: usize = 9;
 
+/// Band of a term.
+#[inline]
+pub const fn band(term: usize) -> usize {
+    match term {
+        0 => 0,
+        1..4 => 1,
+        _ => 2,
+    }
+}
+
 /// Zonal factor of the clamped cosine for each term.
 pub const COSINE_FACTORS: [f32; SH_TERMS] = {
     let (l0, l1, l2) = (PI, 2.0 * PI / 3.0, PI / 4.0);

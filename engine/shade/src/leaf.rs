@@ -4,7 +4,7 @@
 
 use crate::cluster::SECTION_FILL;
 use glam::{DVec3, Vec3};
-use pbgi_core::section::{HalfSpace, section_area, voxel_half_spaces};
+use pbgi_core::section::{HalfSpace, section_area, voxel_half_spaces, voxel_section_area};
 use pbgi_core::{NodeIndex, PointRecord};
 
 /// Planes a leaf is taken apart into; with more it is no edge or corner.
@@ -297,24 +297,24 @@ impl Plane {
 
     /// Area of its points over the area of its section.
     fn fill(&self, half: f32, cuts: &[Cut]) -> f32 {
-        let normal = self.normal.as_dvec3();
-        let mut clips = [HalfSpace {
-            normal: DVec3::ZERO,
-            offset: 0.0,
-        }; 6 + CUTS_MAX];
-        clips[..6].copy_from_slice(&voxel_half_spaces(DVec3::ZERO, f64::from(half), normal));
-        for (clip, cut) in clips[6..].iter_mut().zip(cuts) {
-            *clip = HalfSpace {
-                normal: cut.normal.as_dvec3(),
-                offset: -f64::from(cut.normal.dot(cut.point)),
-            };
-        }
-        let area = section_area(
-            self.centroid.as_dvec3(),
-            normal,
-            4.0 * f64::from(half),
-            &clips[..6 + cuts.len()],
-        );
+        let (through, normal) = (self.centroid.as_dvec3(), self.normal.as_dvec3());
+        let half = f64::from(half);
+        let area = if cuts.is_empty() {
+            voxel_section_area(through, normal, DVec3::ZERO, half)
+        } else {
+            let mut clips = [HalfSpace {
+                normal: DVec3::ZERO,
+                offset: 0.0,
+            }; 6 + CUTS_MAX];
+            clips[..6].copy_from_slice(&voxel_half_spaces(DVec3::ZERO, half, normal));
+            for (clip, cut) in clips[6..].iter_mut().zip(cuts) {
+                *clip = HalfSpace {
+                    normal: cut.normal.as_dvec3(),
+                    offset: -f64::from(cut.normal.dot(cut.point)),
+                };
+            }
+            section_area(through, normal, 4.0 * half, &clips[..6 + cuts.len()])
+        };
         self.area / (area as f32).max(f32::MIN_POSITIVE)
     }
 }
