@@ -1,4 +1,4 @@
-//! Sizes as people write and read them: `2G`, `512M`; "1.5 GiB".
+//! Sizes and counts as people write and read them: `2G`, `512M`; "1.5 GiB"; `20M` points.
 
 const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
 
@@ -11,16 +11,11 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
     let upper = text.trim().to_ascii_uppercase();
     let bare = upper.strip_suffix("IB").or(upper.strip_suffix('B')).unwrap_or(&upper);
     let unit = UNITS.iter().find(|(letter, _)| bare.ends_with(*letter));
-    let (number, shift) = match unit {
+    let (digits, shift) = match unit {
         Some((_, shift)) => (&bare[..bare.len() - 1], *shift),
         None => (bare, 0),
     };
-    let plain = !number.is_empty() && number.chars().all(|c| c.is_ascii_digit() || c == '.');
-    let value: f64 = if plain {
-        number.parse().map_err(|_| fault())?
-    } else {
-        return Err(fault());
-    };
+    let value = number(digits).ok_or_else(fault)?;
     let bytes = value * (1u64 << shift) as f64;
     if bytes < 1.0 {
         return Err(format!("{text:?} is no size: it must be above 0"));
@@ -29,6 +24,32 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
         return Err(format!("{text:?} is more than any machine has"));
     }
     Ok(bytes as u64)
+}
+
+/// Reads how many of something: a number with an optional k, M or G (thousands, millions, billions), at least 1.
+///
+/// # Errors
+/// What is wrong, with an example of what would be right.
+pub fn parse_count(text: &str) -> Result<u64, String> {
+    let fault = || format!("{text:?} is no count: write a whole number from 1 up, or one with k, M or G, such as 20M");
+    let upper = text.trim().to_ascii_uppercase();
+    let unit = UNITS[..3].iter().position(|(letter, _)| upper.ends_with(*letter));
+    let (digits, unit) = match unit {
+        Some(unit) => (&upper[..upper.len() - 1], 1000f64.powi(unit as i32 + 1)),
+        None => (&upper[..], 1.0),
+    };
+    let count = number(digits).ok_or_else(fault)? * unit;
+    if count >= 1.0 && count < (1u64 << 53) as f64 && count.fract() == 0.0 {
+        Ok(count as u64)
+    } else {
+        Err(fault())
+    }
+}
+
+/// A number of digits and at most one point.
+fn number(digits: &str) -> Option<f64> {
+    let plain = !digits.is_empty() && digits.chars().all(|c| c.is_ascii_digit() || c == '.');
+    digits.parse().ok().filter(|_| plain)
 }
 
 /// A size for people: the number, and its unit.
@@ -88,6 +109,35 @@ mod tests {
             "2 G G",
         ] {
             assert!(parse_bytes(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn counts_are_read() {
+        for (text, count) in [
+            ("1", 1),
+            ("2000000", 2_000_000),
+            ("20M", 20_000_000),
+            ("1.5k", 1500),
+            ("1G", 1_000_000_000),
+        ] {
+            assert_eq!(parse_count(text), Ok(count), "{text}");
+        }
+        for text in [
+            "",
+            "M",
+            "0",
+            "-5",
+            "1.5",
+            "0.0001k",
+            "1e6",
+            "20MB",
+            "5T",
+            "99999999G",
+            "many",
+        ] {
+            let fault = parse_count(text).unwrap_err();
+            assert!(fault.contains("such as 20M"), "{text}: {fault}");
         }
     }
 

@@ -178,6 +178,7 @@ fn main() {
         input_key: None,
     };
     let (_, cpu_before) = process_figures();
+    let disk_before = disk_figures();
     let started = Instant::now();
     let mut last = None;
     let mut log = Vec::new();
@@ -191,6 +192,7 @@ fn main() {
     .unwrap();
     let seconds = started.elapsed().as_secs_f64();
     let (peak, cpu) = process_figures();
+    let disk = disk_figures();
     let scene_bytes: u64 = fs::read_dir(&request.output)
         .unwrap()
         .map(|entry| entry.unwrap().metadata().unwrap().len())
@@ -210,13 +212,30 @@ fn main() {
         mega(input_bytes, raw_read_seconds),
         mega(scene_bytes, raw_write_seconds)
     );
+    let (read, written) = (disk.0 - disk_before.0, disk.1 - disk_before.1);
+    let alone =
+        read as f64 * raw_read_seconds / input_bytes as f64 + written as f64 * raw_write_seconds / scene_bytes as f64;
     println!(
-        "share of the disk's rate for the same bytes, scratch aside: {:.2}",
+        "the disk gave {:.2} GB and took {:.2} GB: {alone:.2} s alone; share of its rate {:.2}, of input and scene {:.2}",
+        read as f64 / 1e9,
+        written as f64 / 1e9,
+        alone / seconds,
         (raw_read_seconds + raw_write_seconds) / seconds
     );
     if let Some((_, first)) = log.iter().find(|(stage, _)| *stage == Stage::Building) {
         println!("construction began after {first:.2} s");
     }
+}
+
+/// Bytes that the disk gave this process, and that it has to take: what goes before it was written does not count.
+fn disk_figures() -> (u64, u64) {
+    let text = fs::read_to_string("/proc/self/io").unwrap();
+    let figure = |name: &str| -> u64 {
+        let line = text.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+        line.trim().parse().unwrap()
+    };
+    let given_up = figure("cancelled_write_bytes:");
+    (figure("read_bytes:"), figure("write_bytes:") - given_up)
 }
 
 fn print(options: &Options, report: &BuildReport, seconds: f64, cpu: f64, peak: u64) {

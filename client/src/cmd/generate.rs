@@ -8,6 +8,7 @@ use super::interrupt::Interrupt;
 use super::progress::Progress;
 use super::summary;
 use clap::Args;
+use pbgi_client::size::parse_count;
 use pbgi_core::Statistics;
 use pbgi_points::{Kind, PlyForm, PointsError, ProceduralScene, write_point_ply};
 use std::ops::ControlFlow;
@@ -28,8 +29,8 @@ pub(crate) struct GenerateArgs {
     /// tree, tighten (a head of hair), city or forest
     #[arg(value_name = "KIND")]
     kind: Kind,
-    /// About this many points: the scene grows with them
-    #[arg(long, allow_negative_numbers = true, value_name = "N", default_value_t = 1_000_000, value_parser = clap::value_parser!(u64).range(1..))]
+    /// About this many points: 2000000, 2M; the scene grows with them
+    #[arg(long, allow_negative_numbers = true, value_name = "N", default_value_t = 1_000_000, value_parser = parse_count)]
     points: u64,
     /// Another seed, another scene
     #[arg(long, value_name = "S", default_value_t = 1)]

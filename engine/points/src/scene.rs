@@ -335,22 +335,24 @@ impl SceneParts {
         memory_bytes(&self.geometries, &self.instances, &self.textures)
     }
 
-    /// Puts a geometry to its places: few triangles are copied into `world`, which [`Self::place_once`] takes in the end, for
+    /// Puts a geometry to its `count` places: few triangles are copied into `world`, which [`Self::place_once`] takes in the end, for
     /// one BVH is faster; many are kept once.
     pub(crate) fn place(
         &mut self,
         path: &Path,
         world: &mut Geometry,
         local: Geometry,
-        places: &[DAffine3],
+        count: usize,
+        mut places: impl Iterator<Item = DAffine3>,
     ) -> Result<(), PointsError> {
-        let placed = local.triangles.len().saturating_mul(places.len());
-        if places.len() == 1 || placed <= limits::COPIED_TRIANGLES_MAX {
-            return places.iter().try_for_each(|place| world.append(path, &local, place));
+        let placed = local.triangles.len().saturating_mul(count);
+        if count == 1 || placed <= limits::COPIED_TRIANGLES_MAX {
+            return places.try_for_each(|place| world.append(path, &local, &place));
         }
         let geometry = self.geometries.len();
+        self.instances.reserve_exact(count);
         self.instances
-            .extend(places.iter().map(|place| Instance::new(geometry, place)));
+            .extend(places.map(|place| Instance::new(geometry, &place)));
         self.geometries.push(local);
         Ok(())
     }

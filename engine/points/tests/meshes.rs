@@ -307,6 +307,99 @@ fn colours_of_a_ply_meshs_vertices_are_its_albedo() {
     }
 }
 
+/// A square that one node of a turned parent places often, with these attributes.
+fn instanced(attributes: impl FnOnce(&mut GltfScene) -> serde_json::Value) -> GltfScene {
+    let (mut scene, mesh) = (GltfScene::new(), 0);
+    scene.rectangle(Vec3::ZERO, Vec3::X, Vec3::Y, None);
+    let attributes = attributes(&mut scene);
+    scene.document["extensionsUsed"] = json!(["EXT_mesh_gpu_instancing"]);
+    scene.document["extensionsRequired"] = json!(["EXT_mesh_gpu_instancing"]);
+    let extension = json!({ "EXT_mesh_gpu_instancing": { "attributes": attributes } });
+    let child = scene.push(
+        "nodes",
+        json!({ "mesh": mesh, "scale": [2, 2, 2], "extensions": extension }),
+    );
+    scene.node(json!({ "children": [child], "translation": [0, 1, 0] }));
+    scene
+}
+
+#[test]
+fn instances_of_one_node_lie_where_nodes_of_their_own_would() {
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let (translations, scales) = (
+        [[0.0f32, 0.0, 0.0], [5.0, 0.0, -1.0], [0.0, 9.0, 0.5]],
+        [[1.0f32, 1.0, 1.0], [0.5, 2.0, 1.0], [3.0, 1.0, 1.0]],
+    );
+    let rotations = [[0.0, 0.0, 0.0, 1.0], [0.0, half, 0.0, half], [half, 0.0, 0.0, -half]];
+    let scene = instanced(|scene| {
+        // Rotations as whole numbers, as exporters pack them.
+        let packed: Vec<u8> = rotations
+            .iter()
+            .flatten()
+            .flat_map(|value| ((value * 32_767.0f32).round() as i16).to_le_bytes())
+            .collect();
+        let rotation = scene.accessor(&packed, 3, 5122, "VEC4");
+        scene.document["accessors"][rotation]["normalized"] = json!(true);
+        json!({
+            "TRANSLATION": scene.floats(translations.as_flattened(), "VEC3"),
+            "ROTATION": rotation,
+            "SCALE": scene.floats(scales.as_flattened(), "VEC3"),
+            "_ID": 99,
+        })
+    });
+    let points = sample(scene.load().unwrap(), Density::Spacing(0.1));
+
+    let mut scene = GltfScene::new();
+    let mesh = scene.rectangle(Vec3::ZERO, Vec3::X, Vec3::Y, None);
+    let children: Vec<usize> = (0..3)
+        .map(|i| {
+            let (at, turn, scale) = (translations[i], rotations[i], scales[i]);
+            scene.push(
+                "nodes",
+                json!({ "mesh": mesh, "translation": at, "rotation": turn, "scale": scale }),
+            )
+        })
+        .collect();
+    let middle = scene.push("nodes", json!({ "children": children, "scale": [2, 2, 2] }));
+    scene.node(json!({ "children": [middle], "translation": [0, 1, 0] }));
+    let expected = sample(scene.load().unwrap(), Density::Spacing(0.1));
+
+    assert!(expected.len() > 1000 && points.len() == expected.len());
+    for (point, expected) in points.iter().zip(&expected) {
+        let distance = Vec3::from(point.position).distance(Vec3::from(expected.position));
+        assert!(distance < 1e-3, "{point:?} {expected:?}");
+        assert!(point.normal().dot(expected.normal()) > 0.999);
+    }
+}
+
+#[test]
+fn instances_that_contradict_themselves_are_named() {
+    let says = |parts: &[&str], attributes: &dyn Fn(&mut GltfScene) -> serde_json::Value| {
+        assert_says(instanced(attributes).load(), parts);
+    };
+    says(&["node 0", "neither TRANSLATION"], &|_| json!({}));
+    says(
+        &["node 0", "accessor 99", "not in the file"],
+        &|_| json!({ "SCALE": 99 }),
+    );
+    says(
+        &["node 0", "ROTATION", "no accessor's number"],
+        &|_| json!({ "ROTATION": -1 }),
+    );
+    says(&["node 0", "SCALE", "1 elements"], &|scene| {
+        let (two, one) = (scene.floats(&[1.0; 6], "VEC3"), scene.floats(&[1.0; 3], "VEC3"));
+        json!({ "TRANSLATION": two, "SCALE": one })
+    });
+    says(
+        &["node 0", "must be Vec4"],
+        &|scene| json!({ "ROTATION": scene.floats(&[1.0; 3], "VEC3") }),
+    );
+    says(
+        &["not finite"],
+        &|scene| json!({ "ROTATION": scene.floats(&[0.0; 4], "VEC4") }),
+    );
+}
+
 #[test]
 fn what_is_missing_or_broken_is_named() {
     let load = |path: &Path| MeshScene::load(path);

@@ -5,6 +5,7 @@ use crate::cmd::answer::note;
 use crate::cmd::failure::Failure;
 use crate::cmd::files;
 use clap::Args;
+use pbgi_client::size::parse_count;
 use pbgi_core::BuildSettings;
 use pbgi_points::{CloudOptions, Density, Facing, InvalidPoints, Radius, ViewDensity};
 use std::path::PathBuf;
@@ -13,8 +14,8 @@ use std::path::PathBuf;
 #[derive(Args, Clone, Copy, Debug)]
 #[command(next_help_heading = "Sampling of meshes")]
 pub(crate) struct DensityArgs {
-    /// Number of points on all surfaces together
-    #[arg(long, allow_negative_numbers = true, value_name = "N", value_parser = clap::value_parser!(u64).range(1..), conflicts_with = "spacing")]
+    /// Number of points on all surfaces together: 2000000, 2M
+    #[arg(long, allow_negative_numbers = true, value_name = "N", value_parser = parse_count, conflicts_with = "spacing")]
     pub(crate) points: Option<u64>,
     /// Distance between neighbouring points, world units
     #[arg(long, allow_negative_numbers = true, value_name = "D", value_parser = positive)]

@@ -23,13 +23,34 @@ impl<'a> Accessors<'a> {
         }
     }
 
+    /// Elements of an accessor; `None` if the file has no such accessor.
+    pub(super) fn count(&self, index: usize) -> Option<usize> {
+        self.document.accessors().nth(index).map(|accessor| accessor.count())
+    }
+
+    /// Vectors of an accessor that may be named or not; none of one that is not.
+    pub(super) fn optional<const N: usize>(
+        &self,
+        index: Option<usize>,
+        place: &str,
+    ) -> Result<Vec<[f32; N]>, PointsError> {
+        match index.and_then(|index| self.document.accessors().nth(index)) {
+            Some(accessor) => self.vectors(&accessor, place),
+            None => Ok(Vec::new()),
+        }
+    }
+
     /// Vectors of `N` numbers; whole numbers are normalised.
     pub(super) fn vectors<const N: usize>(
         &self,
         accessor: &gltf::Accessor<'_>,
         place: &str,
     ) -> Result<Vec<[f32; N]>, PointsError> {
-        let expected = if N == 2 { Dimensions::Vec2 } else { Dimensions::Vec3 };
+        let expected = match N {
+            2 => Dimensions::Vec2,
+            3 => Dimensions::Vec3,
+            _ => Dimensions::Vec4,
+        };
         if accessor.dimensions() != expected {
             let found = accessor.dimensions();
             return Err(self.invalid(accessor, place, &format!("is {found:?}, must be {expected:?}")));
@@ -38,6 +59,10 @@ impl<'a> Accessors<'a> {
             DataType::F32 => |b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]),
             DataType::U8 => |b| f32::from(b[0]) / 255.0,
             DataType::U16 => |b| f32::from(u16::from_le_bytes([b[0], b[1]])) / 65535.0,
+            DataType::I8 if accessor.normalized() => |b| (f32::from(b[0] as i8) / 127.0).max(-1.0),
+            DataType::I16 if accessor.normalized() => {
+                |b| (f32::from(i16::from_le_bytes([b[0], b[1]])) / 32767.0).max(-1.0)
+            }
             other => return Err(self.invalid(accessor, place, &format!("has components {other:?}, must be F32"))),
         };
         let size = accessor.data_type().size();

@@ -1,5 +1,6 @@
 //! The bytes of a glTF file: the GLB container, buffers beside it, data URIs.
 
+use super::instancing;
 use crate::error::PointsError;
 use crate::limits;
 use crate::named_file::beside;
@@ -30,8 +31,10 @@ pub(super) fn open(path: &Path) -> Result<(gltf::Document, Option<Vec<u8>>), Poi
         (bytes.as_slice(), None)
     };
     let damaged = |error: gltf::json::Error| PointsError::invalid(path, format!("not a usable glTF file: {error}"));
-    let root: gltf::json::Root = gltf::json::deserialize::from_slice(json).map_err(damaged)?;
+    let mut root: gltf::json::Root = gltf::json::deserialize::from_slice(json).map_err(damaged)?;
     check_positions(path, &root)?;
+    // Read by us, and refused by the crate.
+    root.extensions_required.retain(|name| name != instancing::EXTENSION);
     let document = gltf::Document::from_json(root).map_err(|error| {
         let what = match error {
             gltf::Error::Validation(errors) => match errors.first() {

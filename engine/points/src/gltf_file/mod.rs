@@ -1,11 +1,12 @@
 //! glTF and GLB: nodes, meshes, materials, lights and cameras become [`SceneParts`].
 //!
 //! Read: triangles, strips and fans; base colour, alpha mask, emission with strength; KHR_texture_transform,
-//! KHR_lights_punctual, KHR_materials_emissive_strength. Materials are diffuse: metalness and roughness are not looked at.
+//! KHR_lights_punctual, KHR_materials_emissive_strength, EXT_mesh_gpu_instancing. Materials are diffuse: metalness and roughness are not looked at.
 //! `BLEND` is taken as a mask at an opacity of one half. Skins, morph targets and animations are not applied.
 
 mod accessor;
 mod buffers;
+mod instancing;
 mod materials;
 mod nodes;
 
@@ -14,7 +15,8 @@ use crate::limits;
 use crate::scene::{Geometry, Room, SceneParts};
 use accessor::Accessors;
 use glam::{DAffine3, DMat3, Vec3};
-use std::collections::BTreeMap;
+use instancing::Places;
+use nodes::Uses;
 use std::path::Path;
 
 /// Reads a file and all that it names, if there is room for its buffers.
@@ -32,19 +34,19 @@ pub(crate) fn read(path: &Path, room: Room) -> Result<SceneParts, PointsError> {
         cameras: visited.cameras,
         ..SceneParts::default()
     };
-    // Node transforms by mesh, meshes in ascending order.
-    let mut uses: BTreeMap<usize, Vec<DAffine3>> = BTreeMap::new();
-    for (mesh, transform) in visited.meshes {
-        uses.entry(mesh).or_default().push(transform);
-    }
+    let mut uses = visited.uses;
     let mut world = Geometry::default();
     let accessors = Accessors::new(path, &document, &buffers);
     for mesh in document.meshes() {
-        let Some(transforms) = uses.get(&mesh.index()) else {
+        let Some(Uses { places, instanced }) = uses.remove(&mesh.index()) else {
             continue;
         };
         let local = read_mesh(path, &accessors, &mesh, parts.materials.len())?;
-        parts.place(path, &mut world, local, transforms)?;
+        let instanced = instanced.iter().map(|node| node.places(path, &accessors));
+        let instanced = instanced.collect::<Result<Vec<_>, _>>()?;
+        let count = places.len() + instanced.iter().map(Places::count).sum::<usize>();
+        let places = places.into_iter().chain(instanced.iter().flat_map(Places::transforms));
+        parts.place(path, &mut world, local, count, places)?;
     }
     parts.place_once(world);
     Ok(parts)

@@ -1,5 +1,6 @@
 //! The node hierarchy: where meshes, lights and cameras are.
 
+use super::instancing::Instancing;
 use crate::camera::Camera;
 use crate::error::PointsError;
 use crate::light::{Light, LightKind};
@@ -7,15 +8,26 @@ use crate::limits;
 use glam::{DAffine3, DMat4, DVec3, Mat4, Vec3};
 use gltf::json::extensions::scene::khr_lights_punctual::{Light as LightJson, Type};
 use gltf::json::validation::Checked;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// What the nodes of the scene place, in the order of a depth-first walk.
 #[derive(Default)]
 pub(super) struct Visited {
-    pub(super) meshes: Vec<(usize, DAffine3)>,
+    /// By mesh.
+    pub(super) uses: BTreeMap<usize, Uses>,
     pub(super) lights: Vec<Light>,
     /// In the order of the file's list of cameras, so that their numbers are the file's.
     pub(super) cameras: Vec<Camera>,
+}
+
+/// Where a mesh is.
+#[derive(Default)]
+pub(super) struct Uses {
+    /// Once each.
+    pub(super) places: Vec<DAffine3>,
+    /// Many times each.
+    pub(super) instanced: Vec<Instancing>,
 }
 
 /// Walks the default scene, or the first one.
@@ -46,7 +58,11 @@ pub(super) fn visit(path: &Path, document: &gltf::Document) -> Result<Visited, P
             ));
         }
         if let Some(mesh) = node.mesh() {
-            visited.meshes.push((mesh.index(), DAffine3::from_mat4(world)));
+            let uses = visited.uses.entry(mesh.index()).or_default();
+            match Instancing::read(path, node, world)? {
+                Some(instancing) => uses.instanced.push(instancing),
+                None => uses.places.push(DAffine3::from_mat4(world)),
+            }
         }
         if let Some(light) = light_of(path, document, index, &world)? {
             visited.lights.push(light);

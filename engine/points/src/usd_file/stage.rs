@@ -69,7 +69,7 @@ fn gather(path: &Path, branch: Branch, walk: Walk<'_>, room: Room) -> Result<Sce
     let mut world = Geometry::default();
     for (geometry, places) in geometries.into_iter().zip(places) {
         if !places.is_empty() {
-            parts.place(path, &mut world, geometry, &places)?;
+            parts.place(path, &mut world, geometry, places.len(), places.into_iter())?;
         }
     }
     for (lamp, place) in branch.lamps {

@@ -77,7 +77,11 @@ impl GltfScene {
     }
 
     pub fn floats(&mut self, values: &[f32], shape: &str) -> usize {
-        let width = if shape == "VEC2" { 2 } else { 3 };
+        let width = match shape {
+            "VEC2" => 2,
+            "VEC3" => 3,
+            _ => 4,
+        };
         let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         self.accessor(&bytes, values.len() / width, 5126, shape)
     }
