@@ -24,6 +24,7 @@ pub mod limits;
 pub mod ply;
 pub mod procedural;
 pub mod raycast;
+mod read_once;
 pub mod scene;
 
 mod charts;

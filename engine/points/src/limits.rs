@@ -98,3 +98,8 @@ pub const USD_DEPTH_MAX: usize = 256;
 
 /// Longest time that one prim or one file of a USD stage may take, seconds: composition can be made endless.
 pub const USD_STALL_SECS: u64 = 300;
+
+/// Shortest file that leaves the system's memory as it is read for the last time.
+pub const DROP_BEHIND_MIN: u64 = 1 << 30;
+/// How much of it leaves at once.
+pub const DROP_BEHIND_BYTES: u64 = 8 << 20;

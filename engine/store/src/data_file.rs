@@ -88,6 +88,11 @@ impl DataFile {
         self.storage.will_need(offset, bytes);
     }
 
+    /// Tells the operating system that this part will not be read again.
+    pub fn done_with(&self, offset: u64, bytes: u64) {
+        self.storage.done_with(offset, bytes);
+    }
+
     /// Writes all of `data` at `offset`.
     ///
     /// # Errors

@@ -15,6 +15,11 @@ pub struct OsVolume;
 
 struct OsFile(File);
 
+/// A hint: a file system that knows none does as it likes.
+fn advise(file: &File, offset: u64, bytes: u64, advice: PosixFadviseAdvice) {
+    let _ = posix_fadvise(file, offset as i64, bytes as i64, advice);
+}
+
 impl Storage for OsFile {
     fn byte_len(&self) -> io::Result<u64> {
         Ok(self.0.metadata()?.len())
@@ -25,13 +30,11 @@ impl Storage for OsFile {
     }
 
     fn will_need(&self, offset: u64, bytes: u64) {
-        // A hint: a file system that knows none reads later.
-        let _ = posix_fadvise(
-            &self.0,
-            offset as i64,
-            bytes as i64,
-            PosixFadviseAdvice::POSIX_FADV_WILLNEED,
-        );
+        advise(&self.0, offset, bytes, PosixFadviseAdvice::POSIX_FADV_WILLNEED);
+    }
+
+    fn done_with(&self, offset: u64, bytes: u64) {
+        advise(&self.0, offset, bytes, PosixFadviseAdvice::POSIX_FADV_DONTNEED);
     }
 
     fn write_at(&self, offset: u64, data: &[u8]) -> io::Result<()> {

@@ -224,7 +224,8 @@ impl RunWriter {
     }
 }
 
-/// Reads a run from front to back, some blocks at a time, and deletes it on drop.
+/// Reads a run from front to back, some blocks at a time, and deletes it on drop. What was read leaves the system's memory, where
+/// the scene that is being written takes its place.
 pub struct RunReader {
     run: Run,
     blocks_per_read: usize,
@@ -259,6 +260,7 @@ impl RunReader {
         let place = || format!("run at record {first}");
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(out);
         self.run.file.read_at(first as u64 * RECORD_BYTES, bytes, &place)?;
+        self.run.file.done_with(first as u64 * RECORD_BYTES, bytes.len() as u64);
         let block_bytes = RUN_BLOCK_RECORDS * RECORD_BYTES as usize;
         for block in bytes.chunks(block_bytes) {
             let expected = self.run.checksums[self.blocks_read];

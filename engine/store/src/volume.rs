@@ -28,6 +28,12 @@ pub trait Storage: Send + Sync {
         let _ = (offset, bytes);
     }
 
+    /// Says that this part will not be read again, so that the system need not keep it in memory; what was not written to the
+    /// disk yet is kept.
+    fn done_with(&self, offset: u64, bytes: u64) {
+        let _ = (offset, bytes);
+    }
+
     /// Writes all of `data` at `offset`; the file grows where needed.
     ///
     /// # Errors

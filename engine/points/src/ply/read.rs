@@ -7,6 +7,7 @@ use crate::cloud::{
 };
 use crate::error::PointsError;
 use crate::limits;
+use crate::read_once::ReadOnce;
 use pbgi_core::point::{Reflectance, Sides};
 use pbgi_core::{Bounds, InvalidPoint, PointRecord, PointStream};
 use std::fs::File;
@@ -16,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// A PLY file as a stream of points.
 pub struct PlyPoints {
     path: PathBuf,
-    pub(super) reader: BufReader<File>,
+    pub(super) reader: BufReader<ReadOnce>,
     pub(super) encoding: Encoding,
     /// Elements that lie before the vertices.
     before: Vec<Element>,
@@ -76,7 +77,7 @@ impl PlyPoints {
     pub fn open(path: &Path, origin: [f64; 3], options: &CloudOptions) -> Result<Self, PointsError> {
         let file = File::open(path).map_err(PointsError::io("open", path))?;
         let length = file.metadata().map_err(PointsError::io("read", path))?.len();
-        let mut reader = BufReader::with_capacity(1 << 18, file);
+        let mut reader = BufReader::with_capacity(1 << 18, ReadOnce::new(file));
         let header = Header::read(path, &mut reader)?;
         let place = header.elements.iter().position(|element| element.name == "vertex");
         let Some(place) = place else {
@@ -108,6 +109,11 @@ impl PlyPoints {
             min: relative(bounds.min.map(f64::from), origin),
             max: relative(bounds.max.map(f64::from), origin),
         };
+        let declared = header.bounds.filter(|_| !options.recompute_bounds).map(moved);
+        if declared.is_some() {
+            // With known bounds a build takes one pass.
+            reader.get_mut().for_the_last_time();
+        }
         Ok(Self {
             form,
             path: path.to_owned(),
@@ -116,7 +122,7 @@ impl PlyPoints {
             before,
             data_start: header.bytes,
             header_text: header.text,
-            declared: header.bounds.filter(|_| !options.recompute_bounds).map(moved),
+            declared,
             origin,
             positioned: false,
             door: Door::new(path, vertex.count, options),
@@ -322,6 +328,7 @@ impl PointStream for PlyPoints {
     fn rewind(&mut self) -> Result<(), PointsError> {
         self.door.rewind();
         self.positioned = false;
+        self.reader.get_mut().for_the_last_time();
         let start = self.reader.seek(SeekFrom::Start(self.data_start));
         start.map(drop).map_err(PointsError::io("read", &self.path))
     }
