@@ -124,7 +124,7 @@ impl Sorter {
     }
 
     /// Takes over the runs that a killed build of this input left, if they were sorted by the same lattice. The points in
-    /// them are to come all the same, and are to be given to [`Self::skip_known`].
+    /// them are to come all the same, to be compared and left out.
     ///
     /// # Errors
     /// Those of scratch.
