@@ -5,15 +5,18 @@
 
 #![allow(clippy::unwrap_used, reason = "a benchmark asserts")]
 
+use nix::fcntl::OFlag;
 use pbgi_build::{BuildReport, BuildRequest, Stage, build};
 use pbgi_core::point::Sides;
 use pbgi_core::{Bounds, BuildSettings, PointRecord, PointStream};
 use pbgi_points::{InputOptions, PlyForm, PointsError, open_input, write_point_ply};
 use pbgi_store::Overwrite;
+use pbgi_store::limits::SECTOR_BYTES;
 use pbgi_tests::forget;
-use std::fs::{self, File};
+use std::fs::{self, OpenOptions};
 use std::io::{Read, Write};
 use std::ops::ControlFlow;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -115,31 +118,50 @@ fn bytes(text: &str) -> u64 {
     digits.parse::<u64>().unwrap() * unit
 }
 
-/// Seconds to read the whole file, front to back.
-fn raw_read(path: &Path) -> f64 {
-    let (mut file, mut buffer) = (File::open(path).unwrap(), vec![0; 1 << 20]);
-    let started = Instant::now();
-    while file.read(&mut buffer).unwrap() > 0 {}
-    started.elapsed().as_secs_f64()
+/// Bytes of a transfer of the disk alone.
+const TRANSFER: usize = 1 << 20;
+
+/// The faster of two ways to the disk, through the page cache and past it.
+fn faster(mut transfer: impl FnMut(OFlag) -> f64) -> f64 {
+    transfer(OFlag::empty()).min(transfer(OFlag::O_DIRECT))
 }
 
-/// Seconds to write so many bytes and make them durable.
+/// Seconds to read the whole file, front to back.
+fn raw_read(path: &Path) -> f64 {
+    let mut memory = vec![0; TRANSFER + SECTOR_BYTES];
+    let at = memory.as_ptr().align_offset(SECTOR_BYTES);
+    faster(|flags| {
+        forget(path);
+        let mut file = OpenOptions::new()
+            .read(true)
+            .custom_flags(flags.bits())
+            .open(path)
+            .unwrap();
+        let started = Instant::now();
+        while file.read(&mut memory[at..at + TRANSFER]).unwrap() > 0 {}
+        started.elapsed().as_secs_f64()
+    })
+}
+
+/// Seconds to write so many bytes, but for the last that make no transfer, and to make them durable.
 fn raw_write(path: &Path, bytes: u64) -> f64 {
-    let buffer: Vec<u8> = (0..1 << 20)
-        .map(|i: u32| (i.wrapping_mul(2_654_435_761) >> 13) as u8)
+    let memory: Vec<u8> = (0..(TRANSFER + SECTOR_BYTES) as u32)
+        .map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8)
         .collect();
-    let started = Instant::now();
-    let mut file = File::create(path).unwrap();
-    let mut left = bytes;
-    while left > 0 {
-        let count = left.min(buffer.len() as u64);
-        file.write_all(&buffer[..count as usize]).unwrap();
-        left -= count;
-    }
-    file.sync_all().unwrap();
-    let seconds = started.elapsed().as_secs_f64();
-    fs::remove_file(path).unwrap();
-    seconds
+    let at = memory.as_ptr().align_offset(SECTOR_BYTES);
+    faster(|flags| {
+        let mut options = OpenOptions::new();
+        options.write(true).create_new(true).custom_flags(flags.bits());
+        let started = Instant::now();
+        let mut file = options.open(path).unwrap();
+        for _ in 0..bytes / TRANSFER as u64 {
+            file.write_all(&memory[at..at + TRANSFER]).unwrap();
+        }
+        file.sync_all().unwrap();
+        let seconds = started.elapsed().as_secs_f64();
+        fs::remove_file(path).unwrap();
+        seconds
+    })
 }
 
 /// Largest physical memory of this process so far, and its processor time.

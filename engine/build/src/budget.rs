@@ -7,11 +7,13 @@ use crate::limits::{
 };
 use crate::octree::construction::Gang;
 use crate::octree::subtree::nodes_max;
-use crate::sort::buffer::{KEY_BYTES, POINT_BYTES};
+use crate::sort::radix::SortedPoints;
 use pbgi_core::limits::MORTON_BITS;
-use pbgi_core::{BuildSettings, NodeRecord, PageKind, PointRecord};
-use pbgi_store::PageLayout;
+use pbgi_core::{BuildSettings, NodeRecord, PointRecord};
 use pbgi_store::limits::{RUN_BLOCK_RECORDS, WRITE_BUFFER_BYTES};
+
+/// One for nodes, one for points.
+const PAGE_BUFFER_BYTES: u64 = 2 * WRITE_BUFFER_BYTES as u64;
 
 const BLOCK_BYTES: u64 = (RUN_BLOCK_RECORDS * size_of::<PointRecord>()) as u64;
 
@@ -35,7 +37,7 @@ impl Budget {
     /// # Errors
     /// [`BuildError::Memory`] if the settings need more.
     pub fn new(memory_bytes: u64, threads: usize, settings: &BuildSettings) -> Result<Self, BuildError> {
-        let fixed = MEMORY_RESERVE_BYTES + page_buffer_bytes(settings) + queue_bytes(settings);
+        let fixed = MEMORY_RESERVE_BYTES + PAGE_BUFFER_BYTES + queue_bytes(settings);
         let gang = gang(memory_bytes, fixed, threads, settings);
         let fixed = fixed + job_bytes(gang, settings);
         let needed = MEMORY_MIN_BYTES.max(fixed + SORT_MIN_BYTES);
@@ -46,13 +48,12 @@ impl Budget {
             });
         }
         let sort_bytes = memory_bytes - fixed;
-        // The index of a sort key is a u32.
         let points = |bytes_each: u64| usize::try_from((sort_bytes / bytes_each).min(u64::from(u32::MAX)));
         // One block is the output of an intermediate merge.
         let fan_in = (sort_bytes / BLOCK_BYTES - 1).max(2);
         Ok(Self {
-            core_points: points(POINT_BYTES + KEY_BYTES).unwrap_or(usize::MAX),
-            run_points: points(2 * POINT_BYTES + KEY_BYTES).unwrap_or(usize::MAX),
+            core_points: points(SortedPoints::bytes(1)).unwrap_or(usize::MAX),
+            run_points: points(2 * SortedPoints::bytes(1)).unwrap_or(usize::MAX),
             fan_in: usize::try_from(fan_in).unwrap_or(usize::MAX),
             gang,
             sort_bytes,
@@ -66,13 +67,6 @@ impl Budget {
             .unwrap_or(usize::MAX)
             .clamp(1, BLOCKS_PER_READ_MAX)
     }
-}
-
-fn page_buffer_bytes(settings: &BuildSettings) -> u64 {
-    [PageKind::Node, PageKind::Point]
-        .map(|kind| PageLayout::new(kind, settings).page_bytes().max(WRITE_BUFFER_BYTES) as u64)
-        .iter()
-        .sum()
 }
 
 /// All write-out queues full: `8^1 + .. + 8^chunk_levels` nodes in each.
@@ -123,16 +117,16 @@ mod tests {
     fn what_does_not_fit_is_refused_naming_what_would() {
         let settings = BuildSettings {
             chunk_levels: 5,
-            nodes_per_page: 131_072,
-            points_per_page: 131_072,
+            leaf_max: 1024,
             ..BuildSettings::default()
         };
-        let error = Budget::new(MEMORY_MIN_BYTES, 2, &settings).unwrap_err();
+        let threads = THREADS_MAX;
+        let error = Budget::new(MEMORY_MIN_BYTES, threads, &settings).unwrap_err();
         let BuildError::Memory { needed, .. } = error else {
             panic!("{error}")
         };
-        Budget::new(needed, 2, &settings).unwrap();
-        assert!(Budget::new(needed - 1, 2, &settings).is_err());
+        Budget::new(needed, threads, &settings).unwrap();
+        assert!(Budget::new(needed - 1, threads, &settings).is_err());
     }
 
     #[test]

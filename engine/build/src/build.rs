@@ -3,16 +3,16 @@
 use crate::budget::Budget;
 use crate::error::BuildError;
 use crate::intake::{Intake, Watcher, take_in};
-use crate::limits::DISK_WATCH_POINTS;
+use crate::limits::{CACHED_POINTS_MAX, DISK_WATCH_POINTS};
 use crate::octree::construction::{Constructed, construct};
 use crate::report::{BuildProgress, BuildReport, BuildRequest, Stage};
-use crate::sort::Feed;
-use crate::sort::buffer::BufferFeed;
-use crate::sort::merge::{Merge, MergeFeed};
+use crate::sort::SortedStream;
+use crate::sort::merge::Merge;
+use crate::sort::radix::SortedPoints;
 use crate::sort::sorter::{SortResult, Sorter, Traffic, check_room};
 use pbgi_core::{PointRecord, PointStream, Quantizer, SceneInfo};
 use pbgi_store::limits::RECORDS_MAX;
-use pbgi_store::{OsVolume, SceneWriter, StoreError, Volume};
+use pbgi_store::{IoMode, OsVolume, SceneWriter, StoreError, Volume};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
@@ -78,9 +78,22 @@ pub fn build_on<S: PointStream + ?Sized>(
     budget.fan_in = budget.fan_in.min(host.fan_in_max).max(2);
     budget.gang.job_points = budget.gang.job_points.min(host.job_points_max).max(1);
     let mut watcher = Watcher(observer);
-    // First of all, so that an output that cannot be written is known before the points are sorted.
-    let writer = SceneWriter::create(&host.volume, &request.output, request.overwrite, &request.settings)?;
     let mut sorter = Sorter::new(&host.volume, &request.scratch_dir, request.input_key, budget);
+    sorter.expect(stream.len_hint());
+    let large = stream.len_hint().is_some_and(|points| points > CACHED_POINTS_MAX);
+    let mode = if large || !sorter.fits_core() {
+        IoMode::Direct
+    } else {
+        IoMode::Buffered
+    };
+    // Now, so that an output that cannot be written is known before the points are sorted.
+    let writer = SceneWriter::create(
+        &host.volume,
+        &request.output,
+        request.overwrite,
+        &request.settings,
+        mode,
+    )?;
     let intake = take_in(stream, &mut sorter, host.records_max, &mut watcher)?;
     let job = Job {
         request,
@@ -119,15 +132,15 @@ impl Job<'_> {
             constructed = match sorted {
                 SortResult::Memory(buffer) => {
                     self.watcher.tell(Stage::Sorting, 0, Some(points))?;
-                    let order = buffer.sorted(&quantizer, self.budget.gang.threads);
+                    let mut sorted = SortedPoints::new(buffer, &quantizer, self.budget.gang.threads);
                     self.intake.seconds.sorting += building.elapsed().as_secs_f64();
                     building = Instant::now();
-                    self.construct(&mut BufferFeed::new(buffer, order), &mut writer, &quantizer)?
+                    self.construct(&mut sorted, &mut writer, &quantizer)?
                 }
                 SortResult::Runs(runs, _scratch) => {
                     let blocks = self.budget.blocks_per_read(runs.len());
-                    let merge = Merge::new(runs, blocks, quantizer)?;
-                    self.construct(&mut MergeFeed::new(merge), &mut writer, &quantizer)?
+                    let mut merge = Merge::new(runs, blocks, quantizer)?;
+                    self.construct(&mut merge, &mut writer, &quantizer)?
                 }
             };
         }
@@ -169,7 +182,7 @@ impl Job<'_> {
 
     fn construct(
         &mut self,
-        feed: &mut (dyn Feed + Send),
+        stream: &mut (dyn SortedStream + Send),
         writer: &mut SceneWriter,
         quantizer: &Quantizer,
     ) -> Result<Constructed, BuildError> {
@@ -190,7 +203,7 @@ impl Job<'_> {
             watcher.tell(Stage::Building, done, Some(points))
         };
         let (settings, gang) = (&self.request.settings, self.budget.gang);
-        construct(feed, writer, quantizer, settings, gang, self.records_max, &mut tell)
+        construct(stream, writer, quantizer, settings, gang, self.records_max, &mut tell)
     }
 
     fn describe(&self, constructed: &Constructed, node_slots: u64) -> SceneInfo {

@@ -149,7 +149,6 @@ pub(crate) fn take_in<S: PointStream + ?Sized>(
     watcher: &mut Watcher<'_>,
 ) -> Result<Intake, BuildError<S::Error>> {
     let declared = stream.bounds();
-    sorter.expect(stream.len_hint());
     if let Some(Bounds { min, max }) = declared.filter(|bounds| !bounds.is_empty() && lattice(bounds).is_none()) {
         return Err(BuildError::Bounds { min, max });
     }
@@ -238,7 +237,7 @@ impl Pass {
             sorter.resume(quantizer)?;
         }
         while self.run(stream, sorter, watcher)?.is_break() {
-            sorter.forget()?;
+            sorter.forget().map_err(BuildError::widen)?;
             self.tally = Tally::default();
             stream.rewind().map_err(BuildError::Input)?;
         }

@@ -12,6 +12,10 @@ pub const SORT_MIN_BYTES: u64 = 8 << 20;
 /// Points between two looks at whether the build goes on.
 pub const BATCH_POINTS: usize = 8192;
 
+/// Points of a scene, about a gigabyte, up to which its pages stay in the system's page cache for who shades it next. Those
+/// of a larger one would push out more than they save.
+pub const CACHED_POINTS_MAX: u64 = 1 << 24;
+
 /// Points of a construction job: 2.6 MB with codes and a usual number of nodes, so that handing over costs nothing and
 /// the jobs in flight fit the caches.
 pub const JOB_POINTS_MAX: usize = 1 << 14;

@@ -46,7 +46,7 @@ impl Quantizer {
         let mut cell = [0u32; 3];
         for axis in 0..3 {
             let scaled = (f64::from(position[axis]) - self.origin[axis]) * scale;
-            cell[axis] = scaled.clamp(0.0, CELLS - 1.0) as u32;
+            cell[axis] = floor(scaled.clamp(0.0, CELLS - 1.0));
         }
         cell
     }
@@ -78,15 +78,39 @@ impl MortonCode {
     }
 }
 
-/// Puts two zero bits after each of the low 21 bits.
+/// The whole part of a number from 0 to 2^31, without the checks of a cast: a build takes three of them for every look at a
+/// point.
+#[inline]
+fn floor(value: f64) -> u32 {
+    // Beside 2^52 a double has no fraction: the sum is rounded to nearest, and its low bits are the number.
+    const SHIFT: f64 = (1u64 << 52) as f64;
+    let shifted = value + SHIFT;
+    (shifted.to_bits() as u32).wrapping_sub(u32::from(shifted - SHIFT > value))
+}
+
+/// Bits that [`SPREAD`] spreads at once.
+const SPREAD_BITS: u32 = 11;
+
+/// For every number of [`SPREAD_BITS`] bits the same with two zero bits after each.
+static SPREAD: [u32; 1 << SPREAD_BITS] = {
+    let mut table = [0; 1 << SPREAD_BITS];
+    let mut value = 0;
+    while value < table.len() {
+        let mut bit = 0;
+        while bit < SPREAD_BITS {
+            table[value] |= ((value as u32 >> bit) & 1) << (3 * bit);
+            bit += 1;
+        }
+        value += 1;
+    }
+    table
+};
+
+/// Puts two zero bits after each of the low 22 bits.
 #[inline]
 fn spread(value: u32) -> u64 {
-    let mut v = u64::from(value) & 0x1f_ffff;
-    v = (v | v << 32) & 0x001f_0000_0000_ffff;
-    v = (v | v << 16) & 0x001f_0000_ff00_00ff;
-    v = (v | v << 8) & 0x100f_00f0_0f00_f00f;
-    v = (v | v << 4) & 0x10c3_0c30_c30c_30c3;
-    (v | v << 2) & 0x1249_2492_4924_9249
+    let part = |shift: u32| u64::from(SPREAD[(value >> shift) as usize % SPREAD.len()]);
+    part(0) | part(SPREAD_BITS) << (3 * SPREAD_BITS)
 }
 
 /// The inverse of [`spread`].
@@ -138,6 +162,22 @@ mod tests {
         assert_eq!(quantizer.edge, 1.0);
         assert_eq!(quantizer.code([3.0; 3]), MortonCode(0));
         assert_eq!(Quantizer::from_bounds(&Bounds::EMPTY), None);
+    }
+
+    #[test]
+    fn floor_is_the_cast() {
+        for whole in (0..1u32 << MORTON_BITS).step_by(997).chain([1, (1 << MORTON_BITS) - 1]) {
+            let value = f64::from(whole);
+            for value in [
+                value,
+                value.next_up(),
+                value + 0.5,
+                value.next_down().max(0.0),
+                value + 0.499_999,
+            ] {
+                assert_eq!(floor(value), value as u32, "{value}");
+            }
+        }
     }
 
     proptest! {

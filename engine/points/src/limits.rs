@@ -100,6 +100,6 @@ pub const USD_DEPTH_MAX: usize = 256;
 pub const USD_STALL_SECS: u64 = 300;
 
 /// Shortest file that leaves the system's memory as it is read for the last time.
-pub const DROP_BEHIND_MIN: u64 = 1 << 30;
+pub const DROP_BEHIND_MIN: u64 = 1 << 29;
 /// How much of it leaves at once.
 pub const DROP_BEHIND_BYTES: u64 = 8 << 20;

@@ -6,7 +6,7 @@ use crate::os_volume::OsVolume;
 use crate::temporary::{
     check_replaceable, create_locked, publish, remove_temporary, sweep_temporaries, temporary_path,
 };
-use crate::volume::{Lock, Volume};
+use crate::volume::{IoMode, Lock, Volume};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -60,7 +60,7 @@ impl AtomicFile {
         let (temporary, lock, storage) = create_locked(
             volume.as_ref(),
             || temporary_path(path),
-            |temporary| volume.create_new(temporary),
+            |temporary| volume.create_new(temporary, IoMode::Buffered),
         )?;
         let file = Self {
             file: DataFile::new(volume, &temporary, storage),

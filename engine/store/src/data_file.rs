@@ -2,7 +2,7 @@
 
 use crate::error::StoreError;
 use crate::limits::{READ_ATTEMPTS, READ_BACKOFF};
-use crate::volume::{Storage, Volume, parent};
+use crate::volume::{IoMode, Storage, Volume, parent};
 use nix::errno::Errno;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -23,9 +23,9 @@ impl DataFile {
     ///
     /// # Errors
     /// [`StoreError::Exists`], [`StoreError::NoSpace`], [`StoreError::Io`].
-    pub fn create_new(volume: &Arc<dyn Volume>, path: &Path) -> Result<Self, StoreError> {
+    pub fn create_new(volume: &Arc<dyn Volume>, path: &Path, mode: IoMode) -> Result<Self, StoreError> {
         let storage = volume
-            .create_new(path)
+            .create_new(path, mode)
             .map_err(|error| write_error(volume.as_ref(), "create file", path, 0, error))?;
         Ok(Self::new(volume, path, storage))
     }
@@ -86,11 +86,6 @@ impl DataFile {
     /// Has the operating system begin to read what will be read soon; returns at once.
     pub fn will_need(&self, offset: u64, bytes: u64) {
         self.storage.will_need(offset, bytes);
-    }
-
-    /// Tells the operating system that this part will not be read again.
-    pub fn done_with(&self, offset: u64, bytes: u64) {
-        self.storage.done_with(offset, bytes);
     }
 
     /// Writes all of `data` at `offset`.

@@ -23,6 +23,7 @@ pub mod run;
 pub mod scene;
 pub mod scene_writer;
 pub mod scratch;
+mod sector_buffer;
 pub mod shape;
 pub mod temporary;
 #[cfg(any(test, feature = "testsuite"))]
@@ -43,4 +44,4 @@ pub use scene_writer::SceneWriter;
 pub use scratch::{ScratchDir, Sweep, sweep_scratch};
 pub use shape::{LevelShape, SceneShape};
 pub use temporary::sweep_temporaries;
-pub use volume::{EntryKind, RenameMode, Storage, Volume};
+pub use volume::{EntryKind, IoMode, RenameMode, Storage, Volume};

@@ -11,7 +11,10 @@ pub const HEADER_BYTES: usize = 4096;
 /// Bytes of a checksum in the table behind the last page.
 pub const CHECKSUM_BYTES: u64 = 4;
 
-/// Bytes a page file gathers before it writes, unless one page is larger.
+/// What direct transfers are counted in: at least the sector of any disk, and the block of most file systems.
+pub const SECTOR_BYTES: usize = 4096;
+
+/// Bytes a page file gathers before it writes, whole sectors.
 pub const WRITE_BUFFER_BYTES: usize = 1 << 20;
 
 /// Bytes written to a page file after which it is synced in the background: long enough that a disk works at its full

@@ -1,7 +1,7 @@
 //! [`OsVolume`]: the operating system's own files.
 
-use crate::limits::FILE_MODE;
-use crate::volume::{Entry, EntryKind, Lock, RenameMode, Storage, Volume};
+use crate::limits::{FILE_MODE, SECTOR_BYTES};
+use crate::volume::{Entry, EntryKind, IoMode, Lock, RenameMode, Storage, Volume};
 use nix::fcntl::{AT_FDCWD, OFlag, PosixFadviseAdvice, RenameFlags, posix_fadvise, renameat2};
 use std::fs::{self, DirBuilder, File, FileType, OpenOptions, TryLockError};
 use std::io;
@@ -13,52 +13,91 @@ use std::time::Duration;
 #[derive(Clone, Copy, Debug, Default)]
 pub struct OsVolume;
 
-struct OsFile(File);
+struct OsFile {
+    file: File,
+    /// The same file, opened with O_DIRECT, for whole sectors.
+    direct: Option<File>,
+}
 
-/// A hint: a file system that knows none does as it likes.
-fn advise(file: &File, offset: u64, bytes: u64, advice: PosixFadviseAdvice) {
-    let _ = posix_fadvise(file, offset as i64, bytes as i64, advice);
+impl OsFile {
+    fn buffered(file: File) -> Self {
+        Self { file, direct: None }
+    }
+
+    /// Runs `transfer` past the page cache where it can be, else through it.
+    fn transfer(
+        &self,
+        offset: u64,
+        sectors: bool,
+        mut transfer: impl FnMut(&File) -> io::Result<()>,
+    ) -> io::Result<()> {
+        if let Some(direct) = self
+            .direct
+            .as_ref()
+            .filter(|_| sectors && offset.is_multiple_of(SECTOR_BYTES as u64))
+        {
+            match transfer(direct) {
+                // Larger sectors than ours, or a part of a transfer that ended amid one.
+                Err(error) if error.kind() == io::ErrorKind::InvalidInput => {}
+                result => return result,
+            }
+        }
+        transfer(&self.file)
+    }
+}
+
+fn are_sectors(bytes: &[u8]) -> bool {
+    bytes.len().is_multiple_of(SECTOR_BYTES) && bytes.as_ptr().addr().is_multiple_of(SECTOR_BYTES)
 }
 
 impl Storage for OsFile {
     fn byte_len(&self) -> io::Result<u64> {
-        Ok(self.0.metadata()?.len())
+        Ok(self.file.metadata()?.len())
     }
 
     fn read_at(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
-        self.0.read_exact_at(out, offset)
+        self.transfer(offset, are_sectors(out), |file| file.read_exact_at(out, offset))
     }
 
     fn will_need(&self, offset: u64, bytes: u64) {
-        advise(&self.0, offset, bytes, PosixFadviseAdvice::POSIX_FADV_WILLNEED);
-    }
-
-    fn done_with(&self, offset: u64, bytes: u64) {
-        advise(&self.0, offset, bytes, PosixFadviseAdvice::POSIX_FADV_DONTNEED);
+        let advice = PosixFadviseAdvice::POSIX_FADV_WILLNEED;
+        // A hint: a file system that knows none does as it likes.
+        let _ = posix_fadvise(&self.file, offset as i64, bytes as i64, advice);
     }
 
     fn write_at(&self, offset: u64, data: &[u8]) -> io::Result<()> {
-        self.0.write_all_at(data, offset)
+        self.transfer(offset, are_sectors(data), |file| file.write_all_at(data, offset))
     }
 
     fn set_len(&self, len: u64) -> io::Result<()> {
-        self.0.set_len(len)
+        self.file.set_len(len)
     }
 
     fn sync(&self) -> io::Result<()> {
-        self.0.sync_all()
+        self.file.sync_all()
     }
 }
 
 impl Volume for OsVolume {
-    fn create_new(&self, path: &Path) -> io::Result<Box<dyn Storage>> {
+    fn create_new(&self, path: &Path, mode: IoMode) -> io::Result<Box<dyn Storage>> {
         let file = OpenOptions::new()
             .read(true)
             .write(true)
             .create_new(true)
             .mode(FILE_MODE)
             .open(path)?;
-        Ok(Box::new(OsFile(file)))
+        let mut file = OsFile::buffered(file);
+        if mode == IoMode::Direct {
+            let flags = OFlag::O_DIRECT | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+            let direct = OpenOptions::new()
+                .read(true)
+                .write(true)
+                .custom_flags(flags.bits())
+                .open(path);
+            // A file system that has no such thing is used through the page cache.
+            file.direct = direct.ok();
+        }
+        Ok(Box::new(file))
     }
 
     fn open(&self, path: &Path) -> io::Result<Box<dyn Storage>> {
@@ -68,7 +107,7 @@ impl Volume for OsVolume {
         if !file.metadata()?.is_file() {
             return Err(io::Error::new(io::ErrorKind::InvalidInput, "not a regular file"));
         }
-        Ok(Box::new(OsFile(file)))
+        Ok(Box::new(OsFile::buffered(file)))
     }
 
     fn create_dir(&self, path: &Path, mode: u32) -> io::Result<()> {

@@ -4,24 +4,26 @@ use crate::data_file::DataFile;
 use crate::error::StoreError;
 use crate::limits::{RECORDS_MAX, WRITE_BUFFER_BYTES};
 use crate::page_header::{PageHeader, PageLayout};
-use crate::volume::Volume;
+use crate::sector_buffer::SectorBuffer;
+use crate::volume::{IoMode, Volume};
 use crate::write_behind::WriteBehind;
 use pbgi_core::BuildId;
 use std::path::Path;
 use std::sync::Arc;
 
 /// Writes `[header | pages | checksums]` front to back; the header last, so that an unfinished file never opens.
-/// Memory: one mebibyte or one page, and four bytes a page.
+/// Memory: one mebibyte, and four bytes a page.
 pub struct PageFileWriter {
     file: Arc<DataFile>,
     behind: WriteBehind,
     layout: PageLayout,
-    /// Whole pages and the one that is being filled.
-    buffer: Vec<u8>,
-    buffer_bytes: usize,
+    buffer: SectorBuffer,
     /// Where the buffer goes.
     offset: u64,
+    /// Of the pages whose bytes have all been written.
     checksums: Vec<u32>,
+    /// Of the page that has been written in part, and bytes that it lacks.
+    open_page: (u32, usize),
     slots: u64,
 }
 
@@ -30,18 +32,16 @@ impl PageFileWriter {
     ///
     /// # Errors
     /// [`StoreError::Exists`], [`StoreError::NoSpace`], [`StoreError::Io`].
-    pub fn create(volume: &Arc<dyn Volume>, path: &Path, layout: PageLayout) -> Result<Self, StoreError> {
-        let page_bytes = layout.page_bytes();
-        let buffer_bytes = (WRITE_BUFFER_BYTES / page_bytes).max(1) * page_bytes;
-        let file = Arc::new(DataFile::create_new(volume, path)?);
+    pub fn create(volume: &Arc<dyn Volume>, path: &Path, layout: PageLayout, mode: IoMode) -> Result<Self, StoreError> {
+        let file = Arc::new(DataFile::create_new(volume, path, mode)?);
         Ok(Self {
             behind: WriteBehind::new(&file),
             file,
             layout,
-            buffer: Vec::with_capacity(buffer_bytes),
-            buffer_bytes,
+            buffer: SectorBuffer::with_capacity(WRITE_BUFFER_BYTES),
             offset: layout.page_offset(0),
             checksums: Vec::new(),
+            open_page: (0, layout.page_bytes()),
             slots: 0,
         })
     }
@@ -102,42 +102,54 @@ impl PageFileWriter {
 
     fn pad_to(&mut self, slot: u64) -> Result<(), StoreError> {
         let bytes = (slot - self.slots) as usize * self.layout.record_bytes as usize;
-        let filled = self.buffer.len() + bytes;
-        // Padding ends at the end of a page, so it never passes the end of the buffer.
-        self.buffer.resize(filled, 0);
+        self.append_zeroes(bytes)?;
         self.slots = slot;
-        self.write_if_full()
+        Ok(())
     }
 
     fn append_bytes(&mut self, mut bytes: &[u8]) -> Result<(), StoreError> {
         while !bytes.is_empty() {
-            let room = self.buffer_bytes - self.buffer.len();
-            let (head, tail) = bytes.split_at(room.min(bytes.len()));
-            self.buffer.extend_from_slice(head);
-            bytes = tail;
+            bytes = self.buffer.append(bytes);
+            self.write_if_full()?;
+        }
+        Ok(())
+    }
+
+    fn append_zeroes(&mut self, mut count: usize) -> Result<(), StoreError> {
+        while count > 0 {
+            count = self.buffer.append_zeroes(count);
             self.write_if_full()?;
         }
         Ok(())
     }
 
     fn write_if_full(&mut self) -> Result<(), StoreError> {
-        if self.buffer.len() == self.buffer_bytes {
-            self.write_pages()
+        if self.buffer.room() == 0 {
+            self.write_buffer()
         } else {
             Ok(())
         }
     }
 
-    /// Writes the buffer, which holds whole pages.
-    fn write_pages(&mut self) -> Result<(), StoreError> {
-        let pages = self.buffer.chunks_exact(self.layout.page_bytes());
-        self.checksums.extend(pages.map(crc32c::crc32c));
+    fn write_buffer(&mut self) -> Result<(), StoreError> {
+        let mut rest = self.buffer.bytes();
+        while !rest.is_empty() {
+            let (checksum, lacks) = self.open_page;
+            let (part, tail) = rest.split_at(lacks.min(rest.len()));
+            self.open_page = (crc32c::crc32c_append(checksum, part), lacks - part.len());
+            if part.len() == lacks {
+                self.checksums.push(self.open_page.0);
+                self.open_page = (0, self.layout.page_bytes());
+            }
+            rest = tail;
+        }
         self.file
-            .write_at(self.offset, &self.buffer)
+            .write_at(self.offset, self.buffer.bytes())
             // A file that a sync has abandoned: the sync's own error says more.
             .or_else(|error| self.behind.settle().and(Err(error)))?;
-        self.behind.wrote(self.buffer.len() as u64)?;
-        self.offset += self.buffer.len() as u64;
+        let written = self.buffer.bytes().len() as u64;
+        self.behind.wrote(written)?;
+        self.offset += written;
         self.buffer.clear();
         Ok(())
     }
@@ -147,10 +159,11 @@ impl PageFileWriter {
     /// # Errors
     /// As [`Self::append`].
     pub fn finish(mut self, build_id: BuildId) -> Result<u64, StoreError> {
-        let whole = self.buffer.len().next_multiple_of(self.layout.page_bytes());
-        self.buffer.resize(whole, 0);
-        if !self.buffer.is_empty() {
-            self.write_pages()?;
+        let end = self.layout.page_offset(self.layout.page_count(self.slots));
+        let filled = self.offset + self.buffer.bytes().len() as u64;
+        self.append_zeroes((end - filled) as usize)?;
+        if !self.buffer.bytes().is_empty() {
+            self.write_buffer()?;
         }
         self.behind.settle()?;
         let table: &[u8] = bytemuck::cast_slice(&self.checksums);

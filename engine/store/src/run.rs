@@ -1,4 +1,5 @@
-//! Sort runs: sorted points on scratch, written once, read once, front to back, then deleted.
+//! Sort runs: sorted points on scratch, written once, read once, front to back, then deleted. They go past the system's
+//! page cache: there are runs because memory is short.
 //!
 //! A run is a file of plain records. Its length and the checksum of every block stay in memory; a run that may outlive
 //! its process has them in a file beside it as well, its seal, written when the run is complete.
@@ -8,8 +9,8 @@ use crate::error::StoreError;
 use crate::limits::{RUN_BLOCK_RECORDS, SEAL_BYTES_MAX};
 use crate::page_header::check_sum;
 use crate::scratch::ScratchDir;
-use crate::volume::Volume;
-use bytemuck::Zeroable;
+use crate::sector_buffer::SectorBuffer;
+use crate::volume::{IoMode, Volume};
 use pbgi_core::PointRecord;
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
@@ -23,6 +24,7 @@ const SEAL_SUFFIX: &str = ".seal";
 const SEAL_MAGIC: [u8; 8] = *b"\x89PBGIrun";
 const DIGITS: usize = 6;
 const RECORD_BYTES: u64 = size_of::<PointRecord>() as u64;
+const BLOCK_BYTES: usize = RUN_BLOCK_RECORDS * size_of::<PointRecord>();
 
 /// Whether a file in a scratch folder is a run or its seal.
 pub(crate) fn is_run_name(name: &OsStr) -> bool {
@@ -97,7 +99,7 @@ impl Run {
         let path = seal_path(self.file.path());
         // Before it is written: a torn one is removed as well.
         self.sealed = true;
-        let file = DataFile::create_new(&self.volume, &path)?;
+        let file = DataFile::create_new(&self.volume, &path, IoMode::Buffered)?;
         file.write_at(0, &encode_seal(self.records, note, &self.checksums))
     }
 
@@ -155,7 +157,7 @@ fn decode_seal(bytes: &[u8]) -> Option<(u64, Vec<u8>, Vec<u32>)> {
 /// Writes a run, block by block.
 pub struct RunWriter {
     run: Run,
-    block: Vec<PointRecord>,
+    block: SectorBuffer,
 }
 
 impl RunWriter {
@@ -167,7 +169,7 @@ impl RunWriter {
         let path = run_path(scratch.path(), number);
         let run = Run {
             number,
-            file: DataFile::create_new(scratch.volume(), &path)?,
+            file: DataFile::create_new(scratch.volume(), &path, IoMode::Direct)?,
             volume: scratch.volume().clone(),
             records: 0,
             checksums: Vec::new(),
@@ -175,28 +177,31 @@ impl RunWriter {
         };
         Ok(Self {
             run,
-            block: Vec::with_capacity(RUN_BLOCK_RECORDS),
+            block: SectorBuffer::with_capacity(BLOCK_BYTES),
         })
     }
 
-    /// Appends one point; the caller sees to the order.
+    /// Appends points; the caller sees to the order.
     ///
     /// # Errors
     /// [`StoreError::NoSpace`], [`StoreError::Io`], [`StoreError::Abandoned`].
-    #[inline]
-    pub fn push(&mut self, point: PointRecord) -> Result<(), StoreError> {
-        self.block.push(point);
-        if self.block.len() == RUN_BLOCK_RECORDS {
-            self.write_block()?;
+    pub fn append(&mut self, points: &[PointRecord]) -> Result<(), StoreError> {
+        let mut bytes: &[u8] = bytemuck::cast_slice(points);
+        while !bytes.is_empty() {
+            // A block is a whole number of points.
+            bytes = self.block.append(bytes);
+            if self.block.room() == 0 {
+                self.write_block()?;
+            }
         }
         Ok(())
     }
 
     fn write_block(&mut self) -> Result<(), StoreError> {
-        let bytes: &[u8] = bytemuck::cast_slice(&self.block);
+        let bytes = self.block.bytes();
         self.run.checksums.push(crc32c::crc32c(bytes));
         self.run.file.write_at(self.run.bytes(), bytes)?;
-        self.run.records += self.block.len() as u64;
+        self.run.records += bytes.len() as u64 / RECORD_BYTES;
         self.block.clear();
         Ok(())
     }
@@ -204,9 +209,9 @@ impl RunWriter {
     /// Writes what is left.
     ///
     /// # Errors
-    /// As [`Self::push`].
+    /// As [`Self::append`].
     pub fn finish(mut self) -> Result<Run, StoreError> {
-        if !self.block.is_empty() {
+        if !self.block.bytes().is_empty() {
             self.write_block()?;
         }
         Ok(self.run)
@@ -216,7 +221,7 @@ impl RunWriter {
     /// process. The system's memory outlives the process; a power loss is told by the checksums.
     ///
     /// # Errors
-    /// As [`Self::push`].
+    /// As [`Self::append`].
     pub fn finish_sealed(self, note: &[u8]) -> Result<Run, StoreError> {
         let mut run = self.finish()?;
         run.seal(note)?;
@@ -224,10 +229,11 @@ impl RunWriter {
     }
 }
 
-/// Reads a run from front to back, some blocks at a time, and deletes it on drop. What was read leaves the system's memory, where
-/// the scene that is being written takes its place.
+/// Reads a run from front to back, some blocks at a time, and deletes it on drop.
 pub struct RunReader {
     run: Run,
+    /// What was read last.
+    blocks: SectorBuffer,
     blocks_per_read: usize,
     blocks_read: usize,
 }
@@ -237,32 +243,36 @@ impl RunReader {
     pub fn new(run: Run, blocks_per_read: usize) -> Self {
         Self {
             run,
+            blocks: SectorBuffer::default(),
             blocks_per_read: blocks_per_read.max(1),
             blocks_read: 0,
         }
     }
 
-    /// Replaces the content of `out` by the next records; none at the end.
+    /// What [`Self::advance`] read last.
+    #[inline]
+    pub fn records(&self) -> &[PointRecord] {
+        self.blocks.records()
+    }
+
+    /// Goes on to the next records; none at the end.
     ///
     /// # Errors
     /// [`StoreError::Corrupt`], [`StoreError::Io`].
-    pub fn next_records(&mut self, out: &mut Vec<PointRecord>) -> Result<(), StoreError> {
+    pub fn advance(&mut self) -> Result<(), StoreError> {
         let first = self.blocks_read * RUN_BLOCK_RECORDS;
         let left = self
             .run
             .records
             .saturating_sub(first as u64)
             .min((self.blocks_per_read * RUN_BLOCK_RECORDS) as u64);
-        out.resize(left as usize, PointRecord::zeroed());
-        if out.is_empty() {
+        let bytes = self.blocks.resize((left * RECORD_BYTES) as usize);
+        if bytes.is_empty() {
             return Ok(());
         }
         let place = || format!("run at record {first}");
-        let bytes: &mut [u8] = bytemuck::cast_slice_mut(out);
         self.run.file.read_at(first as u64 * RECORD_BYTES, bytes, &place)?;
-        self.run.file.done_with(first as u64 * RECORD_BYTES, bytes.len() as u64);
-        let block_bytes = RUN_BLOCK_RECORDS * RECORD_BYTES as usize;
-        for block in bytes.chunks(block_bytes) {
+        for block in bytes.chunks(BLOCK_BYTES) {
             let expected = self.run.checksums[self.blocks_read];
             if crc32c::crc32c(block) != expected {
                 check_sum(self.run.file.path(), &place(), block, expected)?;

@@ -11,7 +11,7 @@ use crate::scene::{NODES_NAME, POINTS_NAME};
 use crate::temporary::{
     check_replaceable, create_locked, publish, remove_temporary, sweep_temporaries, temporary_path,
 };
-use crate::volume::{Lock, Volume};
+use crate::volume::{IoMode, Lock, Volume};
 use pbgi_core::{BuildSettings, NodeIndex, NodeRecord, PageKind, PointIndex, PointRecord, SceneInfo};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -42,7 +42,7 @@ impl Drop for TemporaryFolder {
 }
 
 impl SceneWriter {
-    /// Creates the temporary folder and its files. The settings fix the page sizes.
+    /// Creates the temporary folder and its files. The settings fix the page sizes; `mode` is for the pages.
     ///
     /// # Errors
     /// [`StoreError::Exists`] if `output` is taken and `overwrite` refuses, [`StoreError::Foreign`] if it is taken by
@@ -52,6 +52,7 @@ impl SceneWriter {
         output: &Path,
         overwrite: Overwrite,
         settings: &BuildSettings,
+        mode: IoMode,
     ) -> Result<Self, StoreError> {
         let kind = volume
             .kind(output)
@@ -74,8 +75,10 @@ impl SceneWriter {
         };
         // Says now what publishing would say after the work is done.
         check_replaceable(volume.as_ref(), &folder.path, output)?;
-        let file =
-            |name, kind| PageFileWriter::create(volume, &folder.path.join(name), PageLayout::new(kind, settings));
+        let file = |name, kind| {
+            let layout = PageLayout::new(kind, settings);
+            PageFileWriter::create(volume, &folder.path.join(name), layout, mode)
+        };
         Ok(Self {
             nodes: file(NODES_NAME, PageKind::Node)?,
             points: file(POINTS_NAME, PageKind::Point)?,
@@ -150,7 +153,7 @@ impl SceneWriter {
         let mut bytes = self.nodes.finish(info.build_id)? + self.points.finish(info.build_id)?;
         let manifest_path = folder.path.join(MANIFEST_NAME);
         let text = manifest::encode(info, &manifest_path)?;
-        let manifest = DataFile::create_new(&folder.volume, &manifest_path)?;
+        let manifest = DataFile::create_new(&folder.volume, &manifest_path, IoMode::Buffered)?;
         manifest.write_at(0, text.as_bytes())?;
         manifest.sync()?;
         bytes += text.len() as u64;

@@ -28,12 +28,6 @@ pub trait Storage: Send + Sync {
         let _ = (offset, bytes);
     }
 
-    /// Says that this part will not be read again, so that the system need not keep it in memory; what was not written to the
-    /// disk yet is kept.
-    fn done_with(&self, offset: u64, bytes: u64) {
-        let _ = (offset, bytes);
-    }
-
     /// Writes all of `data` at `offset`; the file grows where needed.
     ///
     /// # Errors
@@ -51,6 +45,16 @@ pub trait Storage: Send + Sync {
     /// # Errors
     /// As the system says; the content is then unknown for good.
     fn sync(&self) -> io::Result<()>;
+}
+
+/// How the bytes of a new file travel between memory and disk. Content is the same either way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum IoMode {
+    /// Through the system's page cache, where they stay while there is room: for what is soon read again.
+    Buffered,
+    /// Past the page cache, wherever memory, offset and length are whole sectors and the file system can: for streams longer
+    /// than memory, which would push out everything else and come out again before they are read.
+    Direct,
 }
 
 /// What a rename does when the new name is taken.
@@ -91,7 +95,7 @@ pub trait Volume: Send + Sync {
     ///
     /// # Errors
     /// [`io::ErrorKind::AlreadyExists`] if the name is taken by anything.
-    fn create_new(&self, path: &Path) -> io::Result<Box<dyn Storage>>;
+    fn create_new(&self, path: &Path, mode: IoMode) -> io::Result<Box<dyn Storage>>;
 
     /// Opens a regular file for reading. Symbolic links in the last component are refused.
     ///

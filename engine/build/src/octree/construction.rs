@@ -5,7 +5,8 @@ use crate::error::BuildError;
 use crate::octree::placement::{Placed, Placement};
 use crate::octree::plan::{Crew, Job, Step, plan};
 use crate::octree::subtree::{Subtree, SubtreeBuilder, SubtreeNodes};
-use crate::sort::Feed;
+use crate::sort::SortedStream;
+use crate::sort::feed::{Feed, Piece};
 use pbgi_core::{BuildSettings, PointRecord, Quantizer};
 use pbgi_store::SceneWriter;
 use std::io;
@@ -62,8 +63,7 @@ pub struct BusySeconds {
 #[derive(Default)]
 struct Done {
     steps: Vec<Step>,
-    codes: Vec<u64>,
-    points: Vec<PointRecord>,
+    piece: Piece,
     nodes: SubtreeNodes,
     /// For each subtree of `steps` its root, and the groups of `nodes` below it.
     subtrees: Vec<(Subtree, Range<usize>)>,
@@ -85,13 +85,13 @@ struct Common<'a> {
     spare: &'a Mutex<Vec<Done>>,
 }
 
-/// Makes the octree of all points of `feed` and writes it; `records_max` bounds node slots. `tell` hears how many points
+/// Makes the octree of all points of `stream` and writes it; `records_max` bounds node slots. `tell` hears how many points
 /// have been written.
 ///
 /// # Errors
-/// Those of `feed`, the writer and `tell`; [`BuildError::Limit`] before an index would wrap.
+/// Those of `stream`, the writer and `tell`; [`BuildError::Limit`] before an index would wrap.
 pub fn construct(
-    feed: &mut (dyn Feed + Send),
+    stream: &mut (dyn SortedStream + Send),
     writer: &mut SceneWriter,
     quantizer: &Quantizer,
     settings: &BuildSettings,
@@ -120,7 +120,7 @@ pub fn construct(
             waited: Duration::ZERO,
         };
         let planner = start(scope, "pbgi-plan", move || {
-            dispatcher.run(feed, common, gang.job_points)
+            dispatcher.run(Feed::new(stream), common, gang.job_points)
         })?;
         let placement = Placement::new(writer, quantizer, settings, records_max);
         // The channel goes with it, so that the others end when this does.
@@ -156,7 +156,7 @@ struct Dispatcher {
 
 impl Dispatcher {
     /// Plans everything; returns the seconds worked.
-    fn run(mut self, feed: &mut dyn Feed, common: Common<'_>, job_points: usize) -> f64 {
+    fn run(mut self, feed: Feed<'_>, common: Common<'_>, job_points: usize) -> f64 {
         let started = Instant::now();
         if let Err(error) = plan(feed, &mut self, common.quantizer, common.leaf_max, job_points) {
             // When nobody listens, the writing end has failed before, and says why.
@@ -208,13 +208,13 @@ fn work(jobs: &Mutex<Receiver<(Job, SyncSender<Done>)>>, common: Common<'_>) -> 
 }
 
 fn make(job: Job, done: &mut Done, common: Common<'_>) {
-    job.piece.read(&mut done.codes, &mut done.points);
+    done.piece = job.piece;
     done.nodes.clear();
     done.subtrees.clear();
     done.steps = job.steps;
     let mut builder = SubtreeBuilder {
-        codes: &done.codes,
-        points: &done.points,
+        codes: &done.piece.codes,
+        points: &done.piece.points,
         first_point: job.first_point,
         quantizer: common.quantizer,
         leaf_max: common.leaf_max,
@@ -255,8 +255,8 @@ fn write(
                 // Fails only when the worker panicked, which its end tells.
                 let Ok(mut done) = done.recv() else { continue };
                 let started = Instant::now();
-                append(&mut placement, &mut hash, &done.points)?;
-                points += done.points.len() as u64;
+                append(&mut placement, &mut hash, &done.piece.points)?;
+                points += done.piece.points.len() as u64;
                 put_together(&mut placement, &mut done)?;
                 common.spare.lock().unwrap_or_else(PoisonError::into_inner).push(done);
                 busy += started.elapsed();

@@ -6,7 +6,7 @@
 
 use crate::error::BuildError;
 use crate::octree::subtree::{Subtree, Tallies, count_in, finalize_leaf};
-use crate::sort::{Feed, Piece};
+use crate::sort::feed::{Feed, Piece};
 use pbgi_core::limits::MORTON_BITS;
 use pbgi_core::{ClusterAccumulator, PointIndex, PointRecord, Quantizer, Voxel};
 
@@ -61,7 +61,7 @@ pub trait Crew {
 /// # Errors
 /// Those of the feed and of the crew.
 pub fn plan(
-    feed: &mut dyn Feed,
+    feed: Feed<'_>,
     crew: &mut dyn Crew,
     quantizer: &Quantizer,
     leaf_max: usize,
@@ -82,8 +82,8 @@ pub fn plan(
     plan.send()
 }
 
-struct Plan<'a> {
-    feed: &'a mut dyn Feed,
+struct Plan<'a, 's> {
+    feed: Feed<'s>,
     crew: &'a mut dyn Crew,
     quantizer: &'a Quantizer,
     leaf_max: usize,
@@ -95,7 +95,7 @@ struct Plan<'a> {
     steps: Vec<Step>,
 }
 
-impl Plan<'_> {
+impl Plan<'_, '_> {
     /// The codes behind those planned: `job_points + 1` of them, fewer at the end.
     fn ahead(&mut self) -> Result<&[u64], BuildError> {
         let wanted = self.planned + self.job_points + 1;
@@ -141,8 +141,7 @@ impl Plan<'_> {
             if count == 0 {
                 break;
             }
-            let (mut codes, mut points) = (Vec::new(), Vec::new());
-            self.feed.take(count).read(&mut codes, &mut points);
+            let points = self.feed.take(count).points;
             points.iter().for_each(|point| sum.add(point, self.quantizer));
             self.first_point += count as u64;
             self.crew.write(points)?;

@@ -1,7 +1,8 @@
 //! [`Merge`]: many sorted runs read as one, through a tree of losers (Knuth, volume 3, section 5.4.1).
 
 use crate::error::BuildError;
-use crate::sort::{Feed, Piece};
+use crate::limits::BATCH_POINTS;
+use crate::sort::SortedStream;
 use pbgi_core::{PointRecord, Quantizer};
 use pbgi_store::{Run, RunReader, StoreError};
 
@@ -20,21 +21,21 @@ pub struct Merge {
     quantizer: Quantizer,
 }
 
-/// A run and the part of it in memory. The file stays until the merge goes: should this process die, the next one needs it.
+/// A run and where in its part in memory the merge is. The file stays until the merge goes: should this process die, the next one needs it.
 struct Cursor {
     reader: RunReader,
-    buffer: Vec<PointRecord>,
     next: usize,
 }
 
 impl Cursor {
-    /// Makes sure that `buffer[next]` is the next point; `None` at the end.
+    /// The next point, read if it has to be; `None` at the end.
+    #[inline]
     fn front(&mut self) -> Result<Option<&PointRecord>, StoreError> {
-        if self.next == self.buffer.len() {
+        if self.next == self.reader.records().len() {
             self.next = 0;
-            self.reader.next_records(&mut self.buffer)?;
+            self.reader.advance()?;
         }
-        Ok(self.buffer.get(self.next))
+        Ok(self.reader.records().get(self.next))
     }
 }
 
@@ -54,7 +55,6 @@ impl Merge {
         for (index, run) in runs.into_iter().enumerate() {
             merge.runs.push(Cursor {
                 reader: RunReader::new(run, blocks_per_read),
-                buffer: Vec::new(),
                 next: 0,
             });
             merge.load_code(index)?;
@@ -64,18 +64,15 @@ impl Merge {
     }
 
     /// The next point and its code; `None` at the end.
-    ///
-    /// # Errors
-    /// Scratch cannot be read.
     #[inline]
-    pub fn next_point(&mut self) -> Result<Option<(u64, PointRecord)>, StoreError> {
+    fn next_point(&mut self) -> Result<Option<(u64, PointRecord)>, StoreError> {
         let run = self.winner;
         let code = self.codes.get(run).copied().unwrap_or(ENDED);
         if code == ENDED {
             return Ok(None);
         }
         let cursor = &mut self.runs[run];
-        let point = cursor.buffer[cursor.next];
+        let point = cursor.reader.records()[cursor.next];
         cursor.next += 1;
         self.load_code(run)?;
         self.replay(run);
@@ -125,47 +122,15 @@ impl Merge {
     }
 }
 
-/// Feeds what a merge gives.
-pub struct MergeFeed {
-    merge: Merge,
-    codes: Vec<u64>,
-    points: Vec<PointRecord>,
-    ended: bool,
-}
-
-impl MergeFeed {
-    /// Feeds everything that `merge` has.
-    pub fn new(merge: Merge) -> Self {
-        Self {
-            merge,
-            codes: Vec::new(),
-            points: Vec::new(),
-            ended: false,
+impl SortedStream for Merge {
+    fn next_batch(&mut self, codes: &mut Vec<u64>, points: &mut Vec<PointRecord>) -> Result<bool, BuildError> {
+        let before = codes.len();
+        while codes.len() - before < BATCH_POINTS
+            && let Some((code, point)) = self.next_point()?
+        {
+            codes.push(code);
+            points.push(point);
         }
-    }
-}
-
-impl Feed for MergeFeed {
-    fn codes(&mut self, count: usize) -> Result<&[u64], BuildError> {
-        while self.codes.len() < count && !self.ended {
-            match self.merge.next_point()? {
-                Some((code, point)) => {
-                    self.codes.push(code);
-                    self.points.push(point);
-                }
-                None => self.ended = true,
-            }
-        }
-        Ok(&self.codes)
-    }
-
-    fn take(&mut self, count: usize) -> Piece {
-        // What is left is less than a job, and stays in front.
-        let codes_left = self.codes.split_off(count);
-        let points_left = self.points.split_off(count);
-        Piece::Points(
-            std::mem::replace(&mut self.codes, codes_left),
-            std::mem::replace(&mut self.points, points_left),
-        )
+        Ok(codes.len() > before)
     }
 }

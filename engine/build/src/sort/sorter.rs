@@ -3,9 +3,11 @@
 use crate::budget::Budget;
 use crate::content_hash::UnorderedHash;
 use crate::error::BuildError;
-use crate::limits::{BATCH_POINTS, LEN_HINT_TRUST};
+use crate::limits::LEN_HINT_TRUST;
+use crate::sort::SortedStream;
 use crate::sort::buffer::PointBuffer;
 use crate::sort::merge::Merge;
+use crate::sort::radix::SortedPoints;
 use crate::sort::resume::{Content, Known, Span, without_gaps};
 use pbgi_core::{PointRecord, Quantizer};
 use pbgi_store::{Run, RunWriter, ScratchDir, StoreError, Volume};
@@ -36,7 +38,7 @@ pub struct Sorter {
 
 /// The run that is being made. Dropping it waits for its end, so that nothing is written to scratch any more.
 #[derive(Default)]
-struct Spilling(Option<JoinHandle<Result<Spilled, StoreError>>>);
+struct Spilling(Option<JoinHandle<Result<Spilled, BuildError>>>);
 
 struct Spilled {
     span: Span,
@@ -46,7 +48,7 @@ struct Spilled {
 }
 
 impl Spilling {
-    fn wait(&mut self) -> Result<Option<Spilled>, StoreError> {
+    fn wait(&mut self) -> Result<Option<Spilled>, BuildError> {
         match self.0.take().map(JoinHandle::join) {
             None => Ok(None),
             Some(Ok(spilled)) => spilled.map(Some),
@@ -155,7 +157,7 @@ impl Sorter {
     }
 
     /// Gives up everything: the input is another than that of the runs.
-    pub(crate) fn forget(&mut self) -> Result<(), StoreError> {
+    pub(crate) fn forget(&mut self) -> Result<(), BuildError> {
         self.settle()?;
         self.buffer.clear();
         self.runs.clear();
@@ -219,7 +221,7 @@ impl Sorter {
     }
 
     /// Waits for the run that is being made; returns its memory.
-    fn settle(&mut self) -> Result<Option<PointBuffer>, StoreError> {
+    fn settle(&mut self) -> Result<Option<PointBuffer>, BuildError> {
         let Some(Spilled { span, buffer, seconds }) = self.spilling.wait()? else {
             return Ok(None);
         };
@@ -288,12 +290,13 @@ impl Sorter {
         let mut merge = Merge::new(group.into_iter().map(|span| span.run).collect(), blocks, *quantizer)?;
         let mut writer = RunWriter::create(scratch, self.number())?;
         let mut done = 0u64;
-        while let Some((_, point)) = merge.next_point()? {
-            writer.push(point)?;
-            done += 1;
-            if done.is_multiple_of(BATCH_POINTS as u64) {
-                watch(done)?;
-            }
+        let (mut codes, mut points) = (Vec::new(), Vec::new());
+        while merge.next_batch(&mut codes, &mut points)? {
+            writer.append(&points)?;
+            done += points.len() as u64;
+            watch(done)?;
+            codes.clear();
+            points.clear();
         }
         self.traffic.bytes_read += bytes;
         self.traffic.bytes_written += bytes;
@@ -309,19 +312,23 @@ impl Sorter {
 fn write_run(
     scratch: &ScratchDir,
     number: u64,
-    mut buffer: PointBuffer,
+    buffer: PointBuffer,
     first: u64,
     quantizer: &Quantizer,
     threads: usize,
     sealed: bool,
-) -> Result<Spilled, StoreError> {
+) -> Result<Spilled, BuildError> {
     let started = Instant::now();
-    let order = buffer.sorted(quantizer, threads);
+    let capacity = buffer.capacity();
+    let mut sorted = SortedPoints::new(buffer, quantizer, threads);
     let mut writer = RunWriter::create(scratch, number)?;
     let mut hash = UnorderedHash::default();
-    for point in order.iter(&buffer) {
-        hash.add(&point);
-        writer.push(point)?;
+    let (mut codes, mut points) = (Vec::new(), Vec::new());
+    while sorted.next_batch(&mut codes, &mut points)? {
+        points.iter().for_each(|point| hash.add(point));
+        writer.append(&points)?;
+        codes.clear();
+        points.clear();
     }
     let content = Content { first, hash };
     let run = if sealed {
@@ -329,10 +336,9 @@ fn write_run(
     } else {
         writer.finish()?
     };
-    buffer.clear();
     Ok(Spilled {
         span: Span { run, content },
-        buffer,
+        buffer: PointBuffer::with_spare(sorted.into_spare(), capacity),
         seconds: started.elapsed().as_secs_f64(),
     })
 }

@@ -190,8 +190,8 @@ fn of_two_builds_to_one_name_one_wins() {
 fn a_disk_without_room_is_refused_before_runs_are_written() {
     struct Cramped(Arc<dyn Volume>);
     impl Volume for Cramped {
-        fn create_new(&self, path: &Path) -> std::io::Result<Box<dyn pbgi_store::Storage>> {
-            self.0.create_new(path)
+        fn create_new(&self, path: &Path, mode: pbgi_store::IoMode) -> std::io::Result<Box<dyn pbgi_store::Storage>> {
+            self.0.create_new(path, mode)
         }
         fn open(&self, path: &Path) -> std::io::Result<Box<dyn pbgi_store::Storage>> {
             self.0.open(path)

@@ -1,6 +1,6 @@
 //! [`CrashVolume`]: a disk in memory that knows what a power loss would leave of it.
 
-use crate::volume::{Entry, EntryKind, Lock, RenameMode, Storage, Volume};
+use crate::volume::{Entry, EntryKind, IoMode, Lock, RenameMode, Storage, Volume};
 use nix::errno::Errno;
 use std::collections::{BTreeMap, HashMap};
 use std::ffi::{OsStr, OsString};
@@ -310,7 +310,7 @@ impl Storage for CrashFile {
 }
 
 impl Volume for CrashVolume {
-    fn create_new(&self, path: &Path) -> io::Result<Box<dyn Storage>> {
+    fn create_new(&self, path: &Path, _mode: IoMode) -> io::Result<Box<dyn Storage>> {
         let file = Inode::File {
             live: Vec::new(),
             durable: Vec::new(),

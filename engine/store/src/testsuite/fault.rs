@@ -1,6 +1,6 @@
 //! [`FaultVolume`]: any volume, with one operation, or all from one on, failing.
 
-use crate::volume::{Entry, EntryKind, Lock, RenameMode, Storage, Volume};
+use crate::volume::{Entry, EntryKind, IoMode, Lock, RenameMode, Storage, Volume};
 use nix::errno::Errno;
 use std::io;
 use std::path::Path;
@@ -126,10 +126,10 @@ impl Storage for FaultFile {
 }
 
 impl Volume for FaultVolume {
-    fn create_new(&self, path: &Path) -> io::Result<Box<dyn Storage>> {
+    fn create_new(&self, path: &Path, mode: IoMode) -> io::Result<Box<dyn Storage>> {
         self.check(FaultScope::Space)?;
         Ok(Box::new(FaultFile {
-            inner: self.inner.create_new(path)?,
+            inner: self.inner.create_new(path, mode)?,
             state: self.state.clone(),
         }))
     }

@@ -3,7 +3,7 @@
 use crate::support::{names, write};
 use nix::errno::Errno;
 use pbgi_store::testsuite::{CrashVolume, FaultPlan, FaultScope, FaultVolume};
-use pbgi_store::{AtomicFile, DataFile, Overwrite, Scene, StoreError, Volume, sweep_temporaries};
+use pbgi_store::{AtomicFile, DataFile, IoMode, Overwrite, Scene, StoreError, Volume, sweep_temporaries};
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
@@ -117,7 +117,7 @@ fn after_a_failed_write_or_sync_a_file_takes_no_more() {
             scope: FaultScope::Space,
         };
         let (_, _, volume) = faulty(plan);
-        let file = DataFile::create_new(&volume, Path::new("/x")).unwrap();
+        let file = DataFile::create_new(&volume, Path::new("/x"), IoMode::Buffered).unwrap();
         let first = file.write_at(0, b"first").and_then(|()| file.sync());
         assert!(matches!(first, Err(StoreError::Io { .. })));
         for later in [file.sync(), file.write_at(0, b"again")] {

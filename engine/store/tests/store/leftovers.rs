@@ -158,24 +158,21 @@ fn a_run_comes_back_in_order_and_is_deleted() {
         .enumerate()
     {
         let mut writer = RunWriter::create(&scratch, number as u64).unwrap();
-        for i in 0..count {
-            writer.push(point(i as u32)).unwrap();
-        }
+        let points: Vec<_> = (0..count).map(|i| point(i as u32)).collect();
+        // In parts that know nothing of blocks.
+        points.chunks(1000).for_each(|some| writer.append(some).unwrap());
         let run = writer.finish().unwrap();
         assert_eq!(run.records(), count as u64);
         let mut reader = RunReader::new(run, 2);
-        let (mut buffer, mut next) = (Vec::new(), 0);
+        let mut read = Vec::new();
         loop {
-            reader.next_records(&mut buffer).unwrap();
-            if buffer.is_empty() {
+            reader.advance().unwrap();
+            if reader.records().is_empty() {
                 break;
             }
-            for read in &buffer {
-                assert_eq!(*read, point(next));
-                next += 1;
-            }
+            read.extend_from_slice(reader.records());
         }
-        assert_eq!(next as usize, count);
+        assert!(read == points);
         drop(reader);
         assert!(names(&OsVolume, scratch.path()).is_empty());
     }
@@ -186,14 +183,13 @@ fn a_damaged_run_is_detected() {
     let dir = tempfile::tempdir().unwrap();
     let scratch = ScratchDir::create(&os_volume(), dir.path()).unwrap();
     let mut writer = RunWriter::create(&scratch, 0).unwrap();
-    for i in 0..100 {
-        writer.push(point(i)).unwrap();
-    }
+    let points: Vec<_> = (0..100).map(point).collect();
+    writer.append(&points).unwrap();
     let run = writer.finish().unwrap();
     let file = scratch.path().join("run-000000");
     let mut bytes = fs::read(&file).unwrap();
     bytes[1000] ^= 4;
     fs::write(&file, &bytes).unwrap();
-    let error = RunReader::new(run, 1).next_records(&mut Vec::new()).unwrap_err();
+    let error = RunReader::new(run, 1).advance().unwrap_err();
     assert!(matches!(error, StoreError::Corrupt { .. }), "{error}");
 }

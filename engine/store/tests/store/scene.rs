@@ -2,7 +2,7 @@
 
 use crate::support::{names, node, os_volume, point, read, settings, write};
 use pbgi_core::{PageKind, PageNo};
-use pbgi_store::{Overwrite, Scene, SceneWriter, StoreError};
+use pbgi_store::{IoMode, Overwrite, Scene, SceneWriter, StoreError};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -295,7 +295,8 @@ fn a_folder_that_is_no_scene_is_never_replaced() {
 fn an_unfinished_scene_disappears() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("city.pbgi");
-    let mut writer = SceneWriter::create(&os_volume(), &path, Overwrite::Refuse, &settings()).unwrap();
+    let mut writer =
+        SceneWriter::create(&os_volume(), &path, Overwrite::Refuse, &settings(), IoMode::Buffered).unwrap();
     writer.append_points(&[point(1)]).unwrap();
     assert_eq!(names(&pbgi_store::OsVolume, dir.path()).len(), 1);
     drop(writer);

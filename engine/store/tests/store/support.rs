@@ -4,7 +4,7 @@ use bytemuck::Zeroable;
 use pbgi_core::{
     Bounds, BuildId, BuildSettings, NodeIndex, NodeRecord, PageKind, PageNo, PointRecord, Quantizer, SceneInfo,
 };
-use pbgi_store::{OsVolume, Overwrite, Scene, SceneWriter, StoreError, Volume};
+use pbgi_store::{IoMode, OsVolume, Overwrite, Scene, SceneWriter, StoreError, Volume};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -61,7 +61,7 @@ pub(crate) fn write(
     points: u32,
     build_id: u128,
 ) -> Result<SceneInfo, StoreError> {
-    let mut writer = SceneWriter::create(volume, path, overwrite, &settings())?;
+    let mut writer = SceneWriter::create(volume, path, overwrite, &settings(), IoMode::Direct)?;
     for i in 0..points {
         writer.append_points(&[point(i)])?;
     }
