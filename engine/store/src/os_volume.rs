@@ -184,3 +184,33 @@ fn entry_kind(kind: FileType) -> EntryKind {
         EntryKind::Other
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests assert")]
+mod tests {
+    use super::*;
+    use crate::sector_buffer::SectorBuffer;
+
+    #[test]
+    fn whole_sectors_and_parts_of_them_make_the_same_file_in_either_mode() {
+        let dir = tempfile::tempdir().unwrap();
+        let content: Vec<u8> = (0..3 * SECTOR_BYTES + 5).map(|i| (i % 251) as u8).collect();
+        for mode in [IoMode::Buffered, IoMode::Direct] {
+            let path = dir.path().join(format!("{mode:?}"));
+            let file = OsVolume.create_new(&path, mode).unwrap();
+            let (sectors, tail) = content.split_at(3 * SECTOR_BYTES);
+            let mut memory = SectorBuffer::with_capacity(sectors.len());
+            assert!(memory.append(sectors).is_empty());
+            file.write_at(sectors.len() as u64, tail).unwrap();
+            file.write_at(0, memory.bytes()).unwrap();
+            file.write_at(100, &content[100..110]).unwrap();
+            file.sync().unwrap();
+            assert!(fs::read(&path).unwrap() == content, "{mode:?}");
+            file.read_at(SECTOR_BYTES as u64, memory.resize(2 * SECTOR_BYTES))
+                .unwrap();
+            assert!(memory.bytes() == &content[SECTOR_BYTES..3 * SECTOR_BYTES], "{mode:?}");
+            let past = file.read_at(3 * SECTOR_BYTES as u64, memory.resize(SECTOR_BYTES));
+            assert_eq!(past.unwrap_err().kind(), io::ErrorKind::UnexpectedEof, "{mode:?}");
+        }
+    }
+}
