@@ -1,6 +1,7 @@
 //! Charts: connected pieces of a surface that are nearly flat. Points are laid out on the plane of a chart, so that they
 //! are even across the edges of its triangles, however small those are.
 
+use crate::geometry::area_vector;
 use glam::{DVec3, Vec3};
 
 /// How far a triangle may lean from the plane of its chart, as a cosine (18 degrees): points on it are stretched by at most
@@ -16,6 +17,8 @@ pub(crate) struct Charts {
     order: Vec<u32>,
     /// Where each chart starts in `order`, and the end.
     starts: Vec<u32>,
+    /// Of each chart, in the geometry's space.
+    areas: Vec<f64>,
 }
 
 impl Charts {
@@ -23,7 +26,11 @@ impl Charts {
     /// same vertex.
     pub(crate) fn of(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> Self {
         let neighbours = neighbours(positions, triangles);
-        let normals: Vec<Vec3> = triangles.iter().map(|triangle| normal(positions, triangle)).collect();
+        let area_vectors: Vec<DVec3> = triangles.iter().map(|triangle| area_of(positions, triangle)).collect();
+        let normals: Vec<Vec3> = area_vectors
+            .iter()
+            .map(|area| area.normalize_or_zero().as_vec3())
+            .collect();
         let mut charts = Self::default();
         let mut taken = vec![false; triangles.len()];
         for seed in 0..triangles.len() {
@@ -48,11 +55,24 @@ impl Charts {
             }
         }
         charts.starts.push(charts.order.len() as u32);
+        let area = |chart| {
+            charts
+                .triangles(chart)
+                .iter()
+                .map(|&triangle| area_vectors[triangle as usize].length())
+                .sum()
+        };
+        charts.areas = (0..charts.len()).map(area).collect();
         charts
     }
 
     pub(crate) fn len(&self) -> usize {
         self.starts.len().saturating_sub(1)
+    }
+
+    /// Area of each chart, in the geometry's space.
+    pub(crate) fn areas(&self) -> &[f64] {
+        &self.areas
     }
 
     /// The triangles of a chart, its seed first.
@@ -61,9 +81,8 @@ impl Charts {
     }
 }
 
-fn normal(positions: &[[f32; 3]], triangle: &[u32; 3]) -> Vec3 {
-    let [a, b, c] = triangle.map(|index| DVec3::from_array(positions[index as usize].map(f64::from)));
-    (b - a).cross(c - a).normalize_or_zero().as_vec3()
+fn area_of(positions: &[[f32; 3]], triangle: &[u32; 3]) -> DVec3 {
+    area_vector(&triangle.map(|index| DVec3::from_array(positions[index as usize].map(f64::from))))
 }
 
 /// For each edge of each triangle the triangle on its other side.

@@ -29,6 +29,7 @@ pub mod scene;
 
 mod charts;
 mod estimate;
+mod geometry;
 mod glb;
 mod gltf_file;
 mod material;

@@ -2,9 +2,10 @@
 //! hole. No lights and no cameras.
 
 use crate::error::PointsError;
+use crate::geometry::Geometry;
 use crate::material::{Material, Texture, TextureSlot, Wrap};
 use crate::named_file::beside;
-use crate::scene::{Geometry, SceneParts};
+use crate::scene::SceneParts;
 use crate::texture_file::decode;
 use glam::{Affine2, DAffine3, Vec2};
 use std::cell::Cell;

@@ -1,6 +1,7 @@
 //! Light by casting rays at the mesh itself: the truth that point-based gathering is held against.
 
-use crate::scene::{MeshScene, area_vector};
+use crate::geometry::area_vector;
+use crate::scene::MeshScene;
 use crate::trace::Ray;
 use glam::Vec3;
 use std::f32::consts::PI;

@@ -1,14 +1,14 @@
 //! A mesh scene in memory: triangles, where they are placed, what they are made of, lights and cameras.
 
 use crate::camera::Camera;
-use crate::charts::Charts;
 use crate::error::PointsError;
+use crate::geometry::{Barycentric, Geometry, Instance, area_vector};
 use crate::light::Light;
 use crate::material::{Material, Texture};
 use crate::surroundings::Surroundings;
 use crate::trace::Tracer;
 use crate::{gltf_file, limits, obj_file, ply, scene_file, usd_file};
-use glam::{DAffine3, DVec3, Vec2, Vec3};
+use glam::{DAffine3, Vec3};
 use pbgi_core::Bounds;
 use std::path::Path;
 
@@ -26,34 +26,6 @@ pub struct MeshScene {
     area: f64,
     tracer: Tracer,
 }
-
-/// Triangles in their own space.
-#[derive(Default)]
-pub(crate) struct Geometry {
-    pub(crate) positions: Vec<[f32; 3]>,
-    /// A normal a position, zero where the file has none; or empty.
-    pub(crate) normals: Vec<[f32; 3]>,
-    /// Two sets of texture coordinates, each a pair a position, or empty.
-    pub(crate) uvs: [Vec<[f32; 2]>; 2],
-    /// A factor of the albedo a position, linear; or empty.
-    pub(crate) colors: Vec<[f32; 3]>,
-    pub(crate) triangles: Vec<[u32; 3]>,
-    /// A material a triangle.
-    pub(crate) materials: Vec<u32>,
-    /// Nearly flat pieces, the unit of sampling.
-    pub(crate) charts: Charts,
-}
-
-/// A geometry placed in the world: 52 bytes, for there may be millions.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Instance {
-    geometry: u32,
-    /// Columns of the matrix, then the translation.
-    world_from_local: [f32; 12],
-}
-
-/// A triangle's corner weights for its second and third corner.
-pub(crate) type Barycentric = [f32; 2];
 
 /// A place on a surface.
 #[derive(Clone, Copy, Debug)]
@@ -128,20 +100,19 @@ impl MeshScene {
 
     fn from_parts(mut parts: SceneParts) -> Self {
         for geometry in &mut parts.geometries {
-            geometry.charts = Charts::of(&geometry.positions, &geometry.triangles);
+            geometry.index();
         }
-        let mut bounds = Bounds::EMPTY;
-        let mut area = 0.0;
-        for instance in &parts.instances {
+        let area_of = |instance: &Instance| {
             let geometry = &parts.geometries[instance.geometry()];
-            for triangle in 0..geometry.triangles.len() {
-                let corners = instance.corners(geometry, triangle);
-                corners
-                    .iter()
-                    .for_each(|corner| bounds.include(corner.as_vec3().to_array()));
-                area += area_vector(&corners).length();
+            match instance.area_scale() {
+                Some(scale) => geometry.area() * scale,
+                None => instance
+                    .triangles(geometry)
+                    .map(|corners| area_vector(&corners).length())
+                    .sum(),
             }
-        }
+        };
+        let area = parts.instances.iter().map(area_of).sum();
         let tracer = Tracer::new(&parts.geometries, &parts.instances);
         Self {
             geometries: parts.geometries,
@@ -151,7 +122,7 @@ impl MeshScene {
             lights: parts.lights,
             cameras: parts.cameras,
             environment: parts.environment,
-            bounds,
+            bounds: tracer.bounds(),
             area,
             tracer,
         }
@@ -171,14 +142,6 @@ impl MeshScene {
     pub fn triangle_count(&self) -> u64 {
         let count = |instance: &Instance| self.geometries[instance.geometry()].triangles.len() as u64;
         self.instances.iter().map(count).sum()
-    }
-
-    /// Corners of all triangles in the world, placed ones each time.
-    pub(crate) fn placed_triangles(&self) -> impl Iterator<Item = [DVec3; 3]> + '_ {
-        self.instances.iter().flat_map(|instance| {
-            let geometry = &self.geometries[instance.geometry()];
-            (0..geometry.triangles.len()).map(|triangle| instance.corners(geometry, triangle))
-        })
     }
 
     /// The punctual lights.
@@ -331,7 +294,7 @@ fn memory_bytes(geometries: &[Geometry], instances: &[Instance], textures: &[Tex
 }
 
 impl SceneParts {
-    fn memory_bytes(&self) -> u64 {
+    pub(crate) fn memory_bytes(&self) -> u64 {
         memory_bytes(&self.geometries, &self.instances, &self.textures)
     }
 
@@ -375,7 +338,7 @@ impl SceneParts {
                 .for_each(|material| *material += materials as u32);
         }
         for instance in &mut other.instances {
-            instance.geometry += geometries as u32;
+            instance.renumber(geometries);
         }
         for material in &mut other.materials {
             let slots = [
@@ -411,95 +374,8 @@ impl SceneParts {
                 path: path.to_owned(),
             });
         }
-        for instance in &self.instances {
-            for (index, &position) in self.geometries[instance.geometry()].positions.iter().enumerate() {
-                let world = instance
-                    .world_from_local()
-                    .transform_point3(Vec3::from(position).as_dvec3());
-                if !world.as_vec3().is_finite() {
-                    let what = format!("vertex {index} is not finite in world space: {position:?}");
-                    return Err(PointsError::invalid(path, what));
-                }
-            }
-        }
-        Ok(())
+        self.instances
+            .iter()
+            .try_for_each(|instance| instance.check(path, &self.geometries[instance.geometry()]))
     }
-}
-
-impl Geometry {
-    /// Bytes that it takes at its peak.
-    pub(crate) fn memory_bytes(&self) -> usize {
-        let vertices = size_of_val(&self.positions[..])
-            + size_of_val(&self.normals[..])
-            + self.uvs.iter().map(|uvs| size_of_val(&uvs[..])).sum::<usize>()
-            + size_of_val(&self.colors[..]);
-        vertices + self.triangles.len() * limits::TRIANGLE_BYTES
-    }
-
-    /// Corner positions in its own space.
-    pub(crate) fn corners(&self, triangle: usize) -> [Vec3; 3] {
-        self.triangles[triangle].map(|index| Vec3::from(self.positions[index as usize]))
-    }
-
-    fn uv(&self, set: usize, triangle: usize, [v, w]: Barycentric) -> Vec2 {
-        let corner = |index: u32| {
-            self.uvs[set]
-                .get(index as usize)
-                .map_or(Vec2::ZERO, |uv| Vec2::from(*uv))
-        };
-        let [a, b, c] = self.triangles[triangle].map(corner);
-        a * (1.0 - v - w) + b * v + c * w
-    }
-
-    fn color(&self, triangle: usize, [v, w]: Barycentric) -> Vec3 {
-        if self.colors.is_empty() {
-            return Vec3::ONE;
-        }
-        let [a, b, c] = self.triangles[triangle].map(|index| Vec3::from(self.colors[index as usize]));
-        a * (1.0 - v - w) + b * v + c * w
-    }
-
-    /// Interpolated vertex normal in its own space, if the file has them here.
-    pub(crate) fn vertex_normal(&self, triangle: usize, [v, w]: Barycentric) -> Option<Vec3> {
-        if self.normals.is_empty() {
-            return None;
-        }
-        let [a, b, c] = self.triangles[triangle].map(|index| Vec3::from(self.normals[index as usize]));
-        (a * (1.0 - v - w) + b * v + c * w).try_normalize()
-    }
-}
-
-impl Instance {
-    pub(crate) fn new(geometry: usize, world_from_local: &DAffine3) -> Self {
-        Self {
-            geometry: geometry as u32,
-            world_from_local: world_from_local.to_cols_array().map(|value| value as f32),
-        }
-    }
-
-    pub(crate) fn geometry(&self) -> usize {
-        self.geometry as usize
-    }
-
-    pub(crate) fn world_from_local(&self) -> DAffine3 {
-        DAffine3::from_cols_array(&self.world_from_local.map(f64::from))
-    }
-
-    /// Corner positions in the world.
-    pub(crate) fn corners(&self, geometry: &Geometry, triangle: usize) -> [DVec3; 3] {
-        let world_from_local = self.world_from_local();
-        geometry
-            .corners(triangle)
-            .map(|corner| world_from_local.transform_point3(corner.as_dvec3()))
-    }
-
-    /// Whether it mirrors: the front of its triangles is then on the other side of their winding.
-    pub(crate) fn mirrors(&self) -> bool {
-        self.world_from_local().matrix3.determinant() < 0.0
-    }
-}
-
-/// Normal of a counter-clockwise triangle times its area.
-pub(crate) fn area_vector([a, b, c]: &[DVec3; 3]) -> DVec3 {
-    (b - a).cross(c - a) * 0.5
 }

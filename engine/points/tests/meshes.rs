@@ -372,6 +372,42 @@ fn instances_of_one_node_lie_where_nodes_of_their_own_would() {
     }
 }
 
+/// So many that they are grouped, and each has less than a point: rays find the one above another, and points are spread evenly.
+#[test]
+fn a_multitude_of_instances_is_traced_and_sampled_as_one_would_be() {
+    const SIDE: usize = 200;
+    let mut scene = GltfScene::new();
+    scene.rectangle(Vec3::ZERO, Vec3::X, Vec3::Y, None);
+    // Squares in pairs, one far above the other; in odd columns the lower one lies aside, in the light.
+    let mut places = Vec::new();
+    for index in 0..SIDE * SIDE {
+        let (x, y) = ((index % SIDE) as f32 * 3.0, (index / SIDE) as f32 * 3.0);
+        let aside = if index % 2 == 0 { 0.0 } else { 1.5 };
+        places.extend([[x + aside, y, 0.0], [x, y, 5.0 + x / 100.0]]);
+    }
+    let translation = scene.floats(places.as_flattened(), "VEC3");
+    let extension = json!({ "EXT_mesh_gpu_instancing": { "attributes": { "TRANSLATION": translation } } });
+    scene.node(json!({ "mesh": 0, "extensions": extension }));
+    scene.light(json!({ "type": "directional", "intensity": 1.0 }), json!({}));
+    scene.document["extensionsUsed"] = json!(["EXT_mesh_gpu_instancing", "KHR_lights_punctual"]);
+
+    let whole = scene.load().unwrap();
+    let side = (SIDE - 1) as f32 * 3.0 + 1.0;
+    assert_eq!(whole.bounds().max, [side + 1.5, side, 5.0 + (side - 1.0) / 100.0]);
+    assert!((whole.area() - (2 * SIDE * SIDE) as f64).abs() < 1e-6);
+    let points = sample(whole, Density::Points(20_000));
+    assert!((19_990..=20_010).contains(&points.len()), "{}", points.len());
+    let mut counts = [0; 16];
+    for point in &points {
+        let [x, y, z] = point.position;
+        let (column, lower) = ((x / 3.0) as usize, z < 1.0);
+        let lit = point.sides().front[0] > 0.0;
+        assert_eq!(lit, !lower || column % 2 == 1, "{:?}", point.position);
+        counts[(x / side * 3.99) as usize * 4 + (y / side * 3.99) as usize] += 1;
+    }
+    assert!(counts.iter().all(|count| (1000..1500).contains(count)), "{counts:?}");
+}
+
 #[test]
 fn instances_that_contradict_themselves_are_named() {
     let says = |parts: &[&str], attributes: &dyn Fn(&mut GltfScene) -> serde_json::Value| {

@@ -3,9 +3,10 @@
 use super::GBuffer;
 use crate::camera::Camera;
 use crate::error::PointsError;
+use crate::geometry::area_vector;
 use crate::image::Window;
 use crate::limits;
-use crate::scene::{MeshScene, SurfaceId, area_vector};
+use crate::scene::{MeshScene, SurfaceId};
 use crate::trace::Ray;
 use glam::{DMat3, Vec3};
 use pbgi_core::limits::IMAGE_PIXELS_MAX;

@@ -103,8 +103,8 @@ impl<'a> Accessors<'a> {
         let zeros = [0u8; 64];
         let mut elements = match accessor.view() {
             Some(view) => {
-                let bytes = self.slice(accessor, place, &view, accessor.offset(), count, size)?;
-                bytes.map(&decode).collect()
+                let pieces = self.pieces(accessor, place, &view, accessor.offset(), count, size)?;
+                pieces.iter().map(&decode).collect()
             }
             None => vec![decode(&zeros); count],
         };
@@ -118,7 +118,7 @@ impl<'a> Accessors<'a> {
             gltf::accessor::sparse::IndexType::U32 => DataType::U32,
         };
         let index = self.index_reader(data_type).unwrap_or(|_| u32::MAX);
-        let places = self.slice(
+        let places = self.pieces(
             accessor,
             place,
             &indices.view(),
@@ -126,8 +126,8 @@ impl<'a> Accessors<'a> {
             sparse.count(),
             data_type.size(),
         )?;
-        let replacements = self.slice(accessor, place, &values.view(), values.offset(), sparse.count(), size)?;
-        for (at, bytes) in places.zip(replacements) {
+        let replacements = self.pieces(accessor, place, &values.view(), values.offset(), sparse.count(), size)?;
+        for (at, bytes) in places.iter().zip(replacements.iter()) {
             match elements.get_mut(index(at) as usize) {
                 Some(element) => *element = decode(bytes),
                 None => return Err(self.invalid(accessor, place, "replaces an element that it does not have")),
@@ -137,7 +137,7 @@ impl<'a> Accessors<'a> {
     }
 
     /// `count` pieces of `size` bytes of a buffer view.
-    fn slice(
+    fn pieces(
         &self,
         accessor: &gltf::Accessor<'_>,
         place: &str,
@@ -145,21 +145,24 @@ impl<'a> Accessors<'a> {
         offset: usize,
         count: usize,
         size: usize,
-    ) -> Result<impl Iterator<Item = &'a [u8]> + use<'a>, PointsError> {
+    ) -> Result<Pieces, PointsError> {
         let stride = view.stride().unwrap_or(size).max(size);
         let needed = match count {
             0 => Some(0),
             _ => (count - 1).checked_mul(stride).and_then(|last| last.checked_add(size)),
         };
-        let bytes = self.buffers.view(self.document, view.index());
-        let end = needed.and_then(|needed| offset.checked_add(needed));
-        match (bytes, end) {
-            (Some(bytes), Some(end)) if end <= bytes.len() => {
-                let bytes = &bytes[offset..end];
-                Ok((0..count).map(move |index| &bytes[index * stride..index * stride + size]))
-            }
-            (found, _) => {
-                let found = found.map_or(0, <[u8]>::len);
+        let view = self.buffers.view(self.document, view.index());
+        let end = needed
+            .and_then(|needed| offset.checked_add(needed))
+            .map(|end| end as u64);
+        match (view, end) {
+            (Some(view), Some(end)) if end <= view.len() => Ok(Pieces {
+                bytes: view.read(offset as u64..end)?,
+                stride,
+                size,
+            }),
+            (view, _) => {
+                let found = view.map_or(0, |view| view.len());
                 let what = format!("needs {count} elements of {size} bytes, its buffer view has {found} bytes");
                 Err(self.invalid(accessor, place, &what))
             }
@@ -168,5 +171,19 @@ impl<'a> Accessors<'a> {
 
     fn invalid(&self, accessor: &gltf::Accessor<'_>, place: &str, what: &str) -> PointsError {
         PointsError::invalid(self.path, format!("{place}: accessor {} {what}", accessor.index()))
+    }
+}
+
+/// Elements of an accessor, as they are in its buffer.
+struct Pieces {
+    bytes: Vec<u8>,
+    /// Bytes from one to the next, and of one.
+    stride: usize,
+    size: usize,
+}
+
+impl Pieces {
+    fn iter(&self) -> impl Iterator<Item = &[u8]> {
+        self.bytes.chunks(self.stride).map(|piece| &piece[..self.size])
     }
 }

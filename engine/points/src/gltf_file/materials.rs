@@ -116,11 +116,10 @@ impl Loader<'_> {
                 decode(&source, &read_uri(self.path, uri)?)?
             }
             Some((None, Some(view))) => {
-                let bytes = self.buffers.view(self.document, view.value());
-                let bytes = bytes.ok_or_else(|| {
+                let view = self.buffers.view(self.document, view.value()).ok_or_else(|| {
                     PointsError::invalid(self.path, format!("image {image} reaches beyond its buffer"))
                 })?;
-                decode(self.path, bytes)?
+                decode(self.path, &view.read(0..view.len())?)?
             }
             _ => {
                 return Err(PointsError::invalid(

@@ -11,19 +11,19 @@ mod materials;
 mod nodes;
 
 use crate::error::PointsError;
+use crate::geometry::Geometry;
 use crate::limits;
-use crate::scene::{Geometry, Room, SceneParts};
+use crate::scene::{Room, SceneParts};
 use accessor::Accessors;
-use glam::{DAffine3, DMat3, Vec3};
+use glam::{DAffine3, Vec3};
 use instancing::Places;
 use nodes::Uses;
 use std::path::Path;
 
-/// Reads a file and all that it names, if there is room for its buffers.
+/// Reads a file and all that it names, if there is room for it.
 pub(crate) fn read(path: &Path, room: Room) -> Result<SceneParts, PointsError> {
     let (document, blob) = buffers::open(path)?;
-    let bytes = document.as_json().buffers.iter().map(|buffer| buffer.byte_length.0);
-    room.fits(bytes.fold(0, u64::saturating_add))?;
+    room.fits((document.nodes().len() * limits::NODE_BYTES) as u64)?;
     let buffers = buffers::load(path, &document, blob)?;
     let visited = nodes::visit(path, &document)?;
     let (materials, textures) = materials::load(path, &document, &buffers)?;
@@ -47,6 +47,7 @@ pub(crate) fn read(path: &Path, room: Room) -> Result<SceneParts, PointsError> {
         let count = places.len() + instanced.iter().map(Places::count).sum::<usize>();
         let places = places.into_iter().chain(instanced.iter().flat_map(Places::transforms));
         parts.place(path, &mut world, local, count, places)?;
+        room.fits(parts.memory_bytes() + world.memory_bytes() as u64)?;
     }
     parts.place_once(world);
     Ok(parts)
@@ -119,77 +120,5 @@ fn triangles_of(mode: gltf::mesh::Mode, indices: &[u32]) -> Vec<[u32; 3]> {
             rim.windows(2).map(|pair| [indices[0], pair[0], pair[1]]).collect()
         }
         Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip => Vec::new(),
-    }
-}
-
-impl Geometry {
-    /// Adds `other`, transformed. Triangles without area are dropped; mirrored ones are turned round.
-    pub(crate) fn append(&mut self, path: &Path, other: &Self, transform: &DAffine3) -> Result<(), PointsError> {
-        let base = self.positions.len();
-        let (vertices, triangles) = (
-            base + other.positions.len(),
-            self.triangles.len() + other.triangles.len(),
-        );
-        let largest = vertices.max(triangles);
-        if largest > limits::TRIANGLES_MAX {
-            return Err(PointsError::Limit {
-                what: "number of triangles or vertices",
-                value: largest as u64,
-                limit: limits::TRIANGLES_MAX as u64,
-                path: path.to_owned(),
-            });
-        }
-        self.positions.reserve(other.positions.len());
-        for (index, &position) in other.positions.iter().enumerate() {
-            let world = transform.transform_point3(Vec3::from(position).as_dvec3()).as_vec3();
-            if !world.is_finite() {
-                let what = format!("vertex {index} is not finite in world space: {position:?}");
-                return Err(PointsError::invalid(path, what));
-            }
-            self.positions.push(world.to_array());
-        }
-        let added = other.positions.len();
-        pad(&mut self.normals, &other.normals, base, added, [0.0; 3]);
-        pad(&mut self.colors, &other.colors, base, added, [1.0; 3]);
-        if let Some(new) = self.normals.get_mut(base..) {
-            turn_normals(new, transform.matrix3);
-        }
-        for (mine, theirs) in self.uvs.iter_mut().zip(&other.uvs) {
-            pad(mine, theirs, base, added, [0.0; 2]);
-        }
-        let mirrored = transform.matrix3.determinant() < 0.0;
-        for (&[a, b, c], &material) in other.triangles.iter().zip(&other.materials) {
-            let (b, c) = if mirrored { (c, b) } else { (b, c) };
-            let triangle = [a, b, c].map(|index| index + base as u32);
-            let [a, b, c] = triangle.map(|index| Vec3::from(self.positions[index as usize]).as_dvec3());
-            if (b - a).cross(c - a).length_squared() > 0.0 {
-                self.triangles.push(triangle);
-                self.materials.push(material);
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Appends attributes of `count` vertices after `base` others, keeping an attribute that nobody has empty. Who lacks it gets
-/// `missing`.
-fn pad<const N: usize>(mine: &mut Vec<[f32; N]>, theirs: &[[f32; N]], base: usize, count: usize, missing: [f32; N]) {
-    if mine.is_empty() && theirs.is_empty() {
-        return;
-    }
-    mine.resize(base, missing);
-    mine.extend_from_slice(&theirs[..theirs.len().min(count)]);
-    mine.resize(base + count, missing);
-}
-
-fn turn_normals(normals: &mut [[f32; 3]], world_from_local: DMat3) {
-    if world_from_local == DMat3::IDENTITY {
-        return;
-    }
-    // The cofactors, up to a sign that the user of vertex normals does not look at.
-    let normal_matrix = world_from_local.inverse().transpose();
-    for normal in normals {
-        let turned = normal_matrix * Vec3::from(*normal).as_dvec3();
-        *normal = turned.normalize_or_zero().as_vec3().to_array();
     }
 }

@@ -2,9 +2,10 @@
 
 use super::header::{Element, Encoding, Header, PropertyKind, Scalar};
 use crate::error::PointsError;
+use crate::geometry::{Geometry, Instance};
 use crate::limits;
 use crate::material::{LINEAR_FROM_SRGB, Material};
-use crate::scene::{Geometry, Instance, SceneParts};
+use crate::scene::SceneParts;
 use glam::DAffine3;
 use std::fs::File;
 use std::io::{BufReader, Read};

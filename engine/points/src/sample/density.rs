@@ -3,8 +3,9 @@
 use super::layout::Face;
 use crate::camera::Camera;
 use crate::error::PointsError;
+use crate::geometry::{Geometry, Instance, area_vector};
 use crate::open::ViewDensity;
-use crate::scene::area_vector;
+use crate::scene::MeshScene;
 use glam::DVec3;
 use std::f64::consts::SQRT_2;
 
@@ -47,6 +48,15 @@ pub(super) enum Fit {
     Cut,
 }
 
+/// The points of an instance that are all of one size.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Alike {
+    /// Of a point, square world units.
+    pub(super) area: f64,
+    /// Points a square unit of the geometry's own space.
+    pub(super) density: f64,
+}
+
 impl View {
     /// # Errors
     /// A number that makes no sense.
@@ -84,10 +94,15 @@ impl View {
     fn range(&self, corners: &[DVec3; 3]) -> [f64; 2] {
         let centre = (corners[0] + corners[1] + corners[2]) / 3.0;
         let reach = corners.iter().map(|corner| corner.distance(centre)).fold(0.0, f64::max);
+        self.range_in(centre, reach)
+    }
+
+    /// The smallest and the largest spacing in a ball.
+    fn range_in(&self, centre: DVec3, reach: f64) -> [f64; 2] {
         let offset = centre - self.eye;
         let distance = offset.length();
         let (near, far) = ((distance - reach).max(0.0), distance + reach);
-        // Angles that the sphere around the face spans, seen from the eye.
+        // Angles that the ball spans, seen from the eye.
         let span = if reach < distance {
             (reach / distance).asin()
         } else {
@@ -99,6 +114,14 @@ impl View {
         let unseen = |angle: f64| if angle > self.half_angle { UNSEEN_SPREAD } else { 1.0 };
         let spacing = |distance: f64, unseen: f64| (distance * self.spread * unseen).clamp(self.floor, self.ceiling);
         [spacing(near, unseen(angle - span)), spacing(far, unseen(angle + span))]
+    }
+
+    /// The area of points that may be this near to and this far from each other.
+    fn area_between(&self, [fine, coarse]: [f64; 2]) -> f64 {
+        // In steps of the root of two, so that neighbouring faces mostly have the same.
+        let steps = ((fine * coarse).sqrt() / self.floor).log2() * 2.0;
+        let spacing = self.floor * SQRT_2.powi(steps.round() as i32);
+        spacing * spacing
     }
 }
 
@@ -113,10 +136,42 @@ impl Sizes {
         if coarse > fine * SQRT_2 && face.area > CUT_POINTS_MIN * fine * fine {
             return Fit::Cut;
         }
-        // In steps of the root of two, so that neighbouring faces mostly have the same.
-        let steps = ((fine * coarse).sqrt() / view.floor).log2() * 2.0;
-        let spacing = view.floor * SQRT_2.powi(steps.round() as i32);
-        Fit::Alike(spacing * spacing)
+        Fit::Alike(view.area_between([fine, coarse]))
+    }
+
+    /// The points of a whole instance, if they are alike and its triangles keep their shape.
+    pub(super) fn alike(&self, instance: &Instance, geometry: &Geometry) -> Option<Alike> {
+        let scale = instance.area_scale()?;
+        let area = match self {
+            Self::Even(area) => *area,
+            Self::View(view) => {
+                let reach = f64::from(geometry.bounds.diagonal()) / 2.0 * scale.sqrt();
+                let [fine, coarse] = view.range_in(instance.middle(geometry), reach);
+                if coarse > fine * SQRT_2 {
+                    return None;
+                }
+                view.area_between([fine, coarse])
+            }
+        };
+        Some(Alike {
+            area,
+            density: scale / area,
+        })
+    }
+
+    /// About how many points a scene has.
+    pub(super) fn points_in(&self, scene: &MeshScene) -> f64 {
+        let points = |instance: &Instance| {
+            let geometry = &scene.geometries[instance.geometry()];
+            match self.alike(instance, geometry) {
+                Some(alike) => geometry.area() * alike.density,
+                None => instance
+                    .triangles(geometry)
+                    .map(|corners| self.points_on(&corners))
+                    .sum(),
+            }
+        };
+        scene.instances.iter().map(points).sum()
     }
 
     /// About how many points a triangle has.

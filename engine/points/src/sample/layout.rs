@@ -1,8 +1,9 @@
 //! Where points lie on a surface: on a hexagonal lattice in the plane of each chart, or, on charts too small for one,
 //! wherever the area summed along them passes the next whole point.
 
-use super::density::{Fit, Sizes};
-use crate::scene::{Instance, MeshScene, SurfaceId, area_vector};
+use super::density::{Alike, Fit, Sizes};
+use crate::geometry::area_vector;
+use crate::scene::{MeshScene, SurfaceId};
 use glam::{DAffine2, DMat2, DVec2, DVec3, Vec3};
 use std::f64::consts::{PI, TAU};
 
@@ -28,6 +29,8 @@ pub(crate) struct Surfel {
 pub(crate) struct Layout {
     sizes: Sizes,
     instance: usize,
+    /// The points of that instance, if they are.
+    alike: Option<Alike>,
     chart: usize,
     /// Next triangle of the chart.
     triangle: usize,
@@ -85,6 +88,7 @@ impl Layout {
         Self {
             sizes,
             instance: 0,
+            alike: None,
             chart: 0,
             triangle: 0,
             plane: None,
@@ -118,20 +122,47 @@ impl Layout {
         true
     }
 
-    /// Takes the next triangle; `false` when there is none.
+    /// Takes the next triangle; `false` when there is none. Of what owes no point not every triangle is looked at.
     fn step(&mut self, scene: &MeshScene) -> bool {
         let Some(instance) = scene.instances.get(self.instance) else {
             return false;
         };
         let geometry = &scene.geometries[instance.geometry()];
-        if self.chart >= geometry.charts.len() {
+        let areas = geometry.charts.areas();
+        if self.chart == 0 && self.triangle == 0 {
+            self.alike = self.sizes.alike(instance, geometry);
+            // No chart of it is large enough for a lattice.
+            if self
+                .alike
+                .is_some_and(|alike| self.owes_none(geometry.area() * alike.density))
+            {
+                self.instance += 1;
+                return true;
+            }
+        }
+        let Some(area) = areas.get(self.chart) else {
             self.instance += 1;
             self.chart = 0;
             return true;
-        }
+        };
         let triangles = geometry.charts.triangles(self.chart);
         if self.triangle == 0 {
-            self.plane = self.plane_of(scene, instance, triangles);
+            let points = match self.alike {
+                Some(alike) => area * alike.density,
+                None => {
+                    let points = |&triangle: &u32| self.sizes.points_on(&instance.corners(geometry, triangle as usize));
+                    triangles.iter().map(points).sum()
+                }
+            };
+            if self.owes_none(points) {
+                self.chart += 1;
+                return true;
+            }
+            let large = points >= LATTICE_POINTS_MIN;
+            self.plane = triangles
+                .first()
+                .filter(|_| large)
+                .map(|&seed| self.plane_of(scene, seed));
         }
         let Some(&triangle) = triangles.get(self.triangle) else {
             self.chart += 1;
@@ -146,9 +177,21 @@ impl Layout {
         true
     }
 
+    /// Adds the area of so many points, if together with what is owed it comes to no whole point.
+    fn owes_none(&mut self, points: f64) -> bool {
+        let none = self.owed + points < 1.0;
+        if none {
+            self.owed += points;
+        }
+        none
+    }
+
     /// Begins with the points of a face, or cuts it in two where they differ in size.
     fn place(&mut self, face: Face) {
-        let area = match self.sizes.fit(&face) {
+        let fit = self
+            .alike
+            .map_or_else(|| self.sizes.fit(&face), |alike| Fit::Alike(alike.area));
+        let area = match fit {
             Fit::Alike(area) => area,
             Fit::Cut => return self.pieces.extend(face.halves()),
         };
@@ -163,14 +206,9 @@ impl Layout {
         }
     }
 
-    /// The lattice of a chart that is large enough for one.
-    fn plane_of(&self, scene: &MeshScene, instance: &Instance, triangles: &[u32]) -> Option<Plane> {
-        let geometry = &scene.geometries[instance.geometry()];
-        let points = |triangle: &u32| self.sizes.points_on(&instance.corners(geometry, *triangle as usize));
-        if triangles.iter().map(points).sum::<f64>() < LATTICE_POINTS_MIN {
-            return None;
-        }
-        let seed = Face::new(scene, self.instance, *triangles.first()?);
+    /// The lattice of the chart that begins with `seed`.
+    fn plane_of(&self, scene: &MeshScene, seed: u32) -> Plane {
+        let seed = Face::new(scene, self.instance, seed);
         let noise = |salt: u64| {
             let seed = (self.instance as u64) << 32 ^ self.chart as u64;
             hash(seed ^ hash(salt)) as f64 / 2f64.powi(64)
@@ -184,13 +222,13 @@ impl Layout {
             translation: DVec2::new(noise(2), noise(3)),
         };
         let (u, v) = seed.normal.any_orthonormal_pair();
-        Some(Plane {
+        Plane {
             origin: seed.corners[0],
             normal: seed.normal,
             axes: [u, v],
             lattice_from_plane,
             area,
-        })
+        }
     }
 
     fn next_along(&mut self, face: &Face, area: f64) -> Option<Surfel> {

@@ -53,10 +53,7 @@ impl MeshPoints {
                 let camera = scene.camera(density.camera)?;
                 let diagonal = f64::from(scene.bounds().diagonal());
                 let sizes = Sizes::View(View::new(&density, &camera, diagonal)?);
-                (
-                    sizes,
-                    scene.placed_triangles().map(|corners| sizes.points_on(&corners)).sum(),
-                )
+                (sizes, sizes.points_in(&scene))
             }
         };
         let area = sizes.smallest();

@@ -3,9 +3,10 @@
 use super::Text;
 use super::entries::{DirectionalLight, Lights, PointLight, RectangleLight, SpotLight};
 use crate::error::PointsError;
+use crate::geometry::Geometry;
 use crate::light::{Light, LightKind};
 use crate::material::Material;
-use crate::scene::{Geometry, SceneParts};
+use crate::scene::SceneParts;
 use glam::{DAffine3, Vec3};
 
 /// Adds all lights to `parts`, and what is wrong with them to the problems of `text`.

@@ -6,10 +6,11 @@ mod place;
 
 use crate::camera::Camera;
 use crate::error::PointsError;
+use crate::geometry::Instance;
 use crate::limits;
 use crate::material::Material;
 use crate::named_file::beside;
-use crate::scene::{Instance, SceneParts};
+use crate::scene::SceneParts;
 use crate::surroundings::Surroundings;
 use entries::{Description, Mesh, View};
 use glam::{DAffine3, Mat4, Vec3};

@@ -7,9 +7,9 @@
 use super::shapes;
 use super::values::{Values, forward_of, scale_of};
 use crate::error::PointsError;
+use crate::geometry::{Geometry, area_vector};
 use crate::light::{Light, LightKind};
 use crate::material::Material;
-use crate::scene::{Geometry, area_vector};
 use glam::{DAffine3, DVec3, Vec3};
 use openusd::usd::Prim;
 use std::f64::consts::{FRAC_PI_2, PI};

@@ -2,7 +2,7 @@
 
 use super::values::Values;
 use crate::error::PointsError;
-use crate::scene::Geometry;
+use crate::geometry::Geometry;
 use glam::{DAffine3, DVec3, Vec3};
 use openusd::usd::Prim;
 use std::f64::consts::{PI, TAU};
@@ -190,7 +190,7 @@ fn revolve(profiles: &[&[Rim]]) -> Geometry {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::area_vector;
+    use crate::geometry::area_vector;
 
     /// Area and enclosed volume; the latter is negative if fronts face inwards.
     fn measure(shape: &Geometry) -> (f64, f64) {

@@ -8,8 +8,9 @@ use super::values::{Values, vectors, word};
 use super::{cameras, meshes, shapes, skies};
 use crate::camera::Camera;
 use crate::error::PointsError;
+use crate::geometry::Geometry;
 use crate::limits;
-use crate::scene::{Geometry, Room};
+use crate::scene::Room;
 use crate::surroundings::Surroundings;
 use glam::{DAffine3, DQuat, DVec3};
 use openusd::sdf::{self, Value};
@@ -323,7 +324,7 @@ impl<'a> Walk<'a> {
             .iter()
             .map(|(prototype, _)| prototypes[*prototype].meshes.len())
             .sum();
-        self.room.fits(self.bytes + (placed * limits::INSTANCE_BYTES) as u64)?;
+        self.room.fits(self.bytes + (placed * limits::NODE_BYTES) as u64)?;
         let views = branch.cameras.len();
         for (prototype, place) in places {
             self.extend(prim, branch, &prototypes[prototype], &(context.place * place))?;

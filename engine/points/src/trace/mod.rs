@@ -1,13 +1,18 @@
 //! Rays against the scene: a compressed wide BVH over the triangles of each geometry, and one over the placed geometries.
 //! Masked texels are no surface.
 
-use crate::scene::{Barycentric, Geometry, Instance, MeshScene, SurfaceId};
+mod instances;
+
+use crate::geometry::{Barycentric, Geometry, Instance};
+use crate::scene::{MeshScene, SurfaceId};
 use glam::{DAffine3, Vec3, Vec3A};
+use instances::InstanceTree;
 use obvhs::aabb::Aabb;
 use obvhs::cwbvh::CwBvh;
 use obvhs::cwbvh::builder::build_cwbvh;
 use obvhs::ray::RayHit;
 use obvhs::{Boundable, BvhBuildParams};
+use pbgi_core::Bounds;
 use std::time::Duration;
 
 /// Where to look from, and along which unit vector.
@@ -20,8 +25,7 @@ pub(crate) struct Ray {
 /// The BVHs of a scene.
 pub(crate) struct Tracer {
     geometries: Vec<TriangleBvh>,
-    /// Over the instances' boxes.
-    top: CwBvh,
+    instances: InstanceTree,
 }
 
 struct TriangleBvh {
@@ -48,22 +52,15 @@ impl Boundable for Boxed {
 
 impl Tracer {
     pub(crate) fn new(geometries: &[Geometry], instances: &[Instance]) -> Self {
-        let boxed = |instance: &Instance| {
-            let world_from_local = instance.world_from_local();
-            let mut aabb = Aabb::empty();
-            for position in &geometries[instance.geometry()].positions {
-                let world = world_from_local.transform_point3(Vec3::from(*position).as_dvec3());
-                aabb.extend(Vec3A::from(world.as_vec3()));
-            }
-            // The ray is moved to local space with roundings of its own: let it in a little early.
-            let slack = Vec3A::splat(aabb.min.abs().max(aabb.max.abs()).max_element() * 1e-5);
-            Boxed(Aabb::new(aabb.min - slack, aabb.max + slack))
-        };
-        let boxes: Vec<Boxed> = instances.iter().map(boxed).collect();
         Self {
             geometries: geometries.iter().map(TriangleBvh::new).collect(),
-            top: build(&boxes),
+            instances: InstanceTree::new(geometries, instances),
         }
+    }
+
+    /// The exact box of all triangles, world space.
+    pub(crate) fn bounds(&self) -> Bounds {
+        self.instances.bounds()
     }
 }
 
@@ -199,11 +196,7 @@ impl MeshScene {
         if self.instances.len() == 1 {
             visit(0, f32::INFINITY);
         } else {
-            let mut hit = RayHit::none();
-            let top = &tracer.top;
-            top.ray_traverse(bvh_ray(ray, f32::INFINITY), &mut hit, |bvh_ray, slot| {
-                visit(top.primitive_indices[slot] as usize, bvh_ray.tmax)
-            });
+            tracer.instances.nearest(bvh_ray(ray, f32::INFINITY), visit);
         }
         best
     }
@@ -223,10 +216,6 @@ impl MeshScene {
         if self.instances.len() == 1 {
             return visit(0);
         }
-        let top = &tracer.top;
-        !top.ray_traverse_miss(bvh_ray(ray, limit), |_, slot| {
-            let blocked = visit(top.primitive_indices[slot] as usize);
-            if blocked { 0.0 } else { f32::INFINITY }
-        })
+        tracer.instances.any(bvh_ray(ray, limit), visit)
     }
 }
