@@ -12,6 +12,11 @@ use pbgi_core::{HitSides, NodeRecord};
 
 /// Zonal factor of the clamped cosine times Y00: the first area term of a cluster over its area.
 const AREA_TERM: f32 = 0.886_226_9;
+/// The same of the three linear terms, over the sum of its discs' normals times their areas.
+const NORMAL_TERM: f32 = 1.023_326_7;
+/// Length of the mean normal from which the discs of a cluster are one sheet, and up to which they face everywhere.
+const SHEET_NORMAL: f32 = 0.6;
+const SCATTERED_NORMAL: f32 = 0.2;
 /// A cluster whose normals spread less than this (root mean square sine) and that is thinner than [`FLAT_THICKNESS`] is a
 /// piece of a plane.
 const FLAT_SPREAD: f32 = 0.25;
@@ -191,9 +196,9 @@ impl<'a> Cluster<'a> {
         [front.x * self.normaliser, back.x * self.normaliser]
     }
 
-    /// Projected area of the sides of all discs that count, and power, toward unit directions.
+    /// What it shows of itself toward unit directions.
     #[inline(always)]
-    pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>, sides: HitSides) -> (F, Vector<F>) {
+    pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>, sides: HitSides) -> Shown<F> {
         let terms = self.terms::<F>();
         let y = basis_of(direction);
         let (zero, scale) = (F::splat(0.0), F::splat(self.normaliser));
@@ -203,15 +208,32 @@ impl<'a> Cluster<'a> {
             HitSides::Front => even + odd,
             HitSides::Back => even - odd,
         };
-        let area = shown.max(zero) * scale;
         let [red, green, blue] = [bands(&terms, &y, 1), bands(&terms, &y, 2), bands(&terms, &y, 3)];
-        let power = Vector {
-            x: (red[0] + red[1]).max(zero) * scale,
-            y: (green[0] + green[1]).max(zero) * scale,
-            z: (blue[0] + blue[1]).max(zero) * scale,
-        };
-        (area, power)
+        Shown {
+            area: shown.max(zero) * scale,
+            power: Vector {
+                x: (red[0] + red[1]).max(zero) * scale,
+                y: (green[0] + green[1]).max(zero) * scale,
+                z: (blue[0] + blue[1]).max(zero) * scale,
+            },
+            scattered: scattered(&terms),
+        }
     }
+}
+
+/// A cluster without a plane, seen from some directions.
+pub(crate) struct Shown<F> {
+    /// Projected area of all sides of discs that count, hidden ones too.
+    pub(crate) area: F,
+    pub(crate) power: Vector<F>,
+    /// How much of it is discs that face everywhere, which hide each other at random, as leaves do: 1, or a sheet, folded perhaps: 0.
+    pub(crate) scattered: f32,
+}
+
+fn scattered(terms: &[f32; 4 * SH_TERMS]) -> f32 {
+    let normals = Vec3::new(terms[4], terms[8], terms[12]).length() / NORMAL_TERM;
+    let area = terms[0] / AREA_TERM;
+    ((SHEET_NORMAL - normals / area.max(f32::MIN_POSITIVE)) / (SHEET_NORMAL - SCATTERED_NORMAL)).clamp(0.0, 1.0)
 }
 
 /// Sums of the even and of the odd bands of a channel.

@@ -20,17 +20,41 @@ const NEAR_RADII: f32 = 6.0;
 const DISC_WIDTH: f32 = 4.0;
 /// A receiver under a disc is on it within this many radii ...
 const UNDER_DEPTH: f32 = 0.5;
+/// ... if its middle is no higher above the receiver's horizon: what reaches over an edge starts below it ...
+const OVERHANG: f32 = 0.3;
 /// ... and within this many behind one that faces as it does.
 const BEHIND_DEPTH: f32 = 1.25;
 /// Distance from a plane, as a share of half a voxel's edge or of a disc's radius, that is no distance.
 const TOUCH: f32 = 1e-3;
 /// Share of covered bits from which it pays to ask whether a voxel is hidden.
 const HIDDEN_TEST_SHARE: f32 = 0.1;
-/// Share of its rectangle that a round cluster must show to be drawn opaque; thinner ones are drawn with holes.
+/// Share of its rectangle that a round cluster must cover to be drawn opaque; thinner ones are drawn with holes.
 const OPAQUE_SHARE: f32 = 0.4;
-/// Area by which an opaque round cluster is drawn larger: a rectangle never meets its neighbours exactly, and a closed wall
-/// must not leak.
-const ROUND_SCALE: f32 = 1.2;
+/// Area by which a dense piece of a sheet is drawn larger: a rectangle never meets its neighbours exactly, and a closed wall
+/// must not leak ...
+const WALL_SCALE: f32 = 1.2;
+/// ... if it covers this share of its rectangle.
+const WALL_SHARE: f32 = 0.7;
+
+/// Share of its rectangle that a round cluster covers which shows `share` of it. The parts of a sheet lie side by side; of
+/// scattered discs some hide others: as many as chance has it, 1 - exp(-share), within 2 %.
+#[inline(always)]
+fn covered_share<F: Floats>(share: F, scattered: f32) -> F {
+    /// A share beyond which nothing is open.
+    const FULL: f32 = 8.0;
+    let (one, share) = (F::splat(1.0), share.min(F::splat(FULL)));
+    let series = share * (one + share * (F::splat(0.5) + share * F::splat(1.0 / 6.0)));
+    let by_chance = series / (one + series);
+    let sheet = share.min(one);
+    sheet + F::splat(scattered) * (by_chance - sheet)
+}
+
+/// How much larger a round cluster is drawn than what it covers.
+#[inline(always)]
+fn wall_scale<F: Floats>(covered: F, scattered: f32) -> F {
+    let dense = ((covered - F::splat(OPAQUE_SHARE)) * F::splat(1.0 / (WALL_SHARE - OPAQUE_SHARE))).clamp(0.0, 1.0);
+    dense.mul_add(F::splat((WALL_SCALE - 1.0) * (1.0 - scattered)), F::splat(1.0))
+}
 
 /// Draws elements into the rasters and sums what they add.
 pub(crate) struct Painter<'a, F: Floats, const WORDS: usize> {
@@ -142,24 +166,24 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         }
     }
 
-    /// A cluster without a plane: the rectangle of its covariance seen from the receiver, as wide as its projected area.
+    /// A cluster without a plane: the rectangle of its covariance seen from the receiver, as wide as what it covers.
     #[inline(always)]
     fn draw_round(&mut self, cluster: &Cluster<'_>, visit: &Visit, centroid: Vector<F>, lanes: u8) {
         let frames = &self.pack.frames;
         let distance = centroid.length_squared().sqrt();
         let apart = F::splat(1e-6 * visit.half).less(distance);
         let direction = centroid * (F::splat(1.0) / distance);
-        let (shown, power) = cluster.toward(-direction, self.walk.settings.hit_sides);
+        let shown = cluster.toward(-direction, self.walk.settings.hit_sides);
         let plane = Plane {
             normal: frames.local_from_world(direction),
             distance,
         };
         let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, direction);
-        let four = F::splat(4.0);
-        let tiny = F::splat(1e-30);
-        let share = shown / (four * a * b).max(tiny);
-        let density = (share * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
-        let scale = (share.clamp(OPAQUE_SHARE, 1.0) * F::splat(ROUND_SCALE)).sqrt();
+        let rectangle = (F::splat(4.0) * a * b).max(F::splat(f32::MIN_POSITIVE));
+        let covered = covered_share(shown.area / rectangle, shown.scattered);
+        let density = (covered * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
+        let scale = wall_scale(covered, shown.scattered) * covered.max(F::splat(OPAQUE_SHARE));
+        let scale = scale.sqrt();
         let (a, b) = (a * scale, b * scale);
         let sides = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
         let footprint = Footprint::rectangle(frames.local_from_world(centroid), &plane, sides);
@@ -172,9 +196,10 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let thin = density.less(F::splat(1.0)).lanes() & lanes != 0;
         let covered = self.cover(&footprint, lanes, thin.then_some(density), weight, visit.path);
         if let Some(covered) = covered {
-            let drawn = (four * a * b * density).min(shown).max(tiny);
-            let lit = covered.bits_set().select(covered.light / drawn, F::splat(0.0));
-            self.radiance = self.radiance + power * lit;
+            // What hides behind more than a rectangle's worth is taken for the unlit insides of a body.
+            let visible = shown.area.min(rectangle);
+            let lit = covered.bits_set().select(covered.light / visible, F::splat(0.0));
+            self.radiance = self.radiance + shown.power * lit;
         }
     }
 
@@ -276,7 +301,9 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
             is_aligned(receiver_normal, normal) & distance.less(F::splat(self.walk.settings.bias * disc.radius));
         let own = touched | is_own_surface(receiver_normal, normal, center, DISC_WIDTH * disc.radius);
         let beside = squared - distance * distance;
-        let under = beside.less(F::splat((DISC_SCALE * disc.radius).powi(2)))
+        let overhangs = receiver_normal.dot(center).less(F::splat(OVERHANG * disc.radius));
+        let under = overhangs
+            & beside.less(F::splat((DISC_SCALE * disc.radius).powi(2)))
             & distance.less(F::splat(UNDER_DEPTH * disc.radius));
         let facing = F::splat(SAME_SHEET).less(normal.dot(receiver_normal));
         let behind =

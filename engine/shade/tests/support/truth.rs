@@ -25,6 +25,12 @@ pub enum Shape {
     Ground {
         half: f32,
     },
+    /// A square with two sides; half of its edges, across each other.
+    Leaf {
+        center: Vec3,
+        u: Vec3,
+        v: Vec3,
+    },
 }
 
 pub struct Truth {
@@ -67,6 +73,37 @@ impl Truth {
                 low,
                 high: middle + Vec3::new(width, height, width),
             });
+        }
+        Self {
+            shapes,
+            sun: (Vec3::new(0.5, 0.7, 0.35).normalize(), 3.0),
+            shadows: true,
+        }
+    }
+
+    /// Four crowns of 200 leaves each over a ground: they hide a third of what is behind them.
+    pub fn crowns() -> Self {
+        let mut state = 7u64;
+        let mut random = || {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+        };
+        let mut in_ball = || {
+            std::iter::repeat_with(|| Vec3::new(random(), random(), random()))
+                .find(|place| place.length_squared() < 1.0)
+                .unwrap_or_default()
+        };
+        let mut shapes = vec![Shape::Ground { half: 3.0 }];
+        for crown in 0..4 {
+            let middle = Vec3::new((crown % 2) as f32 * 3.0 - 1.5, 2.5, (crown / 2) as f32 * 3.0 - 1.5);
+            for _ in 0..200 {
+                let (u, v) = in_ball().normalize_or(Vec3::Y).any_orthonormal_pair();
+                let center = middle + in_ball();
+                let (u, v) = (u * 0.06, v * 0.06);
+                shapes.push(Shape::Leaf { center, u, v });
+            }
         }
         Self {
             shapes,
@@ -144,6 +181,9 @@ impl Truth {
                         &mut points,
                     );
                 }
+                Shape::Leaf { center, u, v } => {
+                    rectangle(center - u - v, 2.0 * u, 2.0 * v, spacing, &mut points);
+                }
                 Shape::Block { low, high } => {
                     let d = high - low;
                     let (x, y, z) = (Vec3::X * d.x, Vec3::Y * d.y, Vec3::Z * d.z);
@@ -160,10 +200,12 @@ impl Truth {
             }
         }
         for point in &mut points {
-            let radiance = self.radiance(point.position.into(), point.normal());
+            let radiance = |normal: Vec3| [self.radiance(point.position.into(), normal); 3];
+            // The backs of all others are inside of something, or below the ground.
+            let leaf = self.shapes.iter().any(|shape| matches!(shape, Shape::Leaf { .. }));
             let sides = Sides {
-                front: [radiance; 3],
-                back: [0.0; 3],
+                front: radiance(point.normal()),
+                back: if leaf { radiance(-point.normal()) } else { [0.0; 3] },
             };
             *point = PointRecord::new(point.position, point.normal().to_array(), point.radius, sides).unwrap();
         }
@@ -189,6 +231,7 @@ impl Truth {
             Shape::Sphere { center, radius } => position.distance(center) < radius,
             Shape::Block { low, high } => position.cmpgt(low).all() && position.cmplt(high).all(),
             Shape::Ground { .. } => position.y < 0.0,
+            Shape::Leaf { .. } => false,
         })
     }
 }
@@ -215,6 +258,7 @@ fn area(shape: &Shape) -> f32 {
     match *shape {
         Shape::Sphere { radius, .. } => 4.0 * PI * radius * radius,
         Shape::Ground { half } => 4.0 * half * half,
+        Shape::Leaf { u, v, .. } => 4.0 * u.length() * v.length(),
         Shape::Block { low, high } => {
             let d = high - low;
             d.x * d.z + 2.0 * d.y * (d.x + d.z)
@@ -228,6 +272,14 @@ fn intersect(shape: &Shape, origin: Vec3, direction: Vec3) -> Option<(f32, Vec3)
             let t = -origin.y / direction.y;
             let p = origin + direction * t;
             (t > 1e-4 && p.x.abs() <= half && p.z.abs() <= half).then_some((t, Vec3::Y))
+        }
+        Shape::Leaf { center, u, v } => {
+            let normal = u.cross(v).normalize();
+            let normal = normal * -normal.dot(direction).signum();
+            let t = normal.dot(center - origin) / normal.dot(direction);
+            let offset = origin + direction * t - center;
+            let inside = |edge: Vec3| offset.dot(edge).abs() <= edge.length_squared();
+            (t > 1e-4 && inside(u) && inside(v)).then_some((t, normal))
         }
         Shape::Sphere { center, radius } => {
             let m = origin - center;
