@@ -64,11 +64,15 @@ impl<'a> Neighbours<'a> {
     /// The `K` points nearest to point `of`, itself left out; fewer if there are no more. Of points equally far, those
     /// that come first in the search.
     pub(super) fn nearest<const K: usize>(&self, of: usize) -> Nearest<K> {
-        let mut nearest = Nearest {
-            found: [(self.bound::<K>(of), 0); K],
-            len: 0,
-        };
-        self.visit(self.levels.len() - 1, 0, of, &mut nearest);
+        let mut nearest = Nearest::within(self.bound::<K>(of));
+        self.visit(self.levels.len() - 1, 0, self.positions[of], Some(of), &mut nearest);
+        nearest
+    }
+
+    /// The `K` points nearest to a place; fewer if there are no more.
+    pub(super) fn nearest_to<const K: usize>(&self, place: Vec3) -> Nearest<K> {
+        let mut nearest = Nearest::within(f32::INFINITY);
+        self.visit(self.levels.len() - 1, 0, place, None, &mut nearest);
         nearest
     }
 
@@ -77,10 +81,7 @@ impl<'a> Neighbours<'a> {
         let from = self.positions[of];
         let first = of.saturating_sub(K);
         let end = (of + K + 1).min(self.positions.len());
-        let mut beside = Nearest::<K> {
-            found: [(f32::INFINITY, 0); K],
-            len: 0,
-        };
+        let mut beside = Nearest::<K>::within(f32::INFINITY);
         for other in (first..end).filter(|&other| other != of) {
             beside.offer(self.positions[other].distance_squared(from), other as u32);
         }
@@ -88,13 +89,19 @@ impl<'a> Neighbours<'a> {
         beside.limit().next_up()
     }
 
-    fn visit<const K: usize>(&self, level: usize, index: usize, of: usize, nearest: &mut Nearest<K>) {
-        let from = self.positions[of];
+    fn visit<const K: usize>(
+        &self,
+        level: usize,
+        index: usize,
+        from: Vec3,
+        except: Option<usize>,
+        nearest: &mut Nearest<K>,
+    ) {
         let first = index * FAN;
         if level == 0 {
             let end = (first + FAN).min(self.positions.len());
             for other in first..end {
-                if other != of {
+                if Some(other) != except {
                     nearest.offer(self.positions[other].distance_squared(from), other as u32);
                 }
             }
@@ -112,18 +119,26 @@ impl<'a> Neighbours<'a> {
             if distance >= nearest.limit() {
                 break;
             }
-            self.visit(level - 1, child, of, nearest);
+            self.visit(level - 1, child, from, except, nearest);
         }
     }
 }
 
 impl<const K: usize> Nearest<K> {
+    /// Of points that are nearer than the root of `squared`.
+    pub(super) fn within(squared: f32) -> Self {
+        Self {
+            found: [(squared, 0); K],
+            len: 0,
+        }
+    }
+
     fn limit(&self) -> f32 {
         self.found[K - 1].0
     }
 
     #[inline]
-    fn offer(&mut self, distance: f32, index: u32) {
+    pub(super) fn offer(&mut self, distance: f32, index: u32) {
         if distance >= self.limit() {
             return;
         }
