@@ -193,7 +193,7 @@ impl Wanted {
         let (points, own) = surroundings(ordered, range)?;
         let positions: Vec<Vec3> = points.iter().map(|point| Vec3::from(point.position)).collect();
         let neighbours = Neighbours::new(&positions);
-        let sides = outward.map(Outward::sides);
+        let mut sides = outward.map(Outward::sides);
         let cell = (ordered.quantizer().edge / f64::from(1u32 << MORTON_BITS)) as f32;
         let mut block = Vec::with_capacity(own.len());
         for index in own {
@@ -204,7 +204,7 @@ impl Wanted {
                 None => point.normal(),
                 Some(facing) => {
                     let around = found.iter().map(|&(_, other)| positions[other as usize]);
-                    let towards = match (facing, &sides) {
+                    let towards = match (facing, &mut sides) {
                         (Facing::Viewpoint(eye), _) => Vec3::from(eye) - position,
                         (Facing::Outward, Some(sides)) => sides.towards(position),
                         _ => Vec3::Y,

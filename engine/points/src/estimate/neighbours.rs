@@ -69,9 +69,16 @@ impl<'a> Neighbours<'a> {
         nearest
     }
 
-    /// The `K` points nearest to a place; fewer if there are no more.
-    pub(super) fn nearest_to<const K: usize>(&self, place: Vec3) -> Nearest<K> {
-        let mut nearest = Nearest::within(f32::INFINITY);
+    /// The `K` points nearest to a place; fewer if there are no more. Those that were nearest to a place nearby shorten the
+    /// search.
+    pub(super) fn nearest_to<const K: usize>(&self, place: Vec3, nearby: &Nearest<K>) -> Nearest<K> {
+        let farthest = nearby.found().iter().fold(0.0, |farthest: f32, &(_, other)| {
+            farthest.max(self.positions[other as usize].distance_squared(place))
+        });
+        let mut nearest = Nearest::within(match nearby.len {
+            len if len == K => farthest.next_up(),
+            _ => f32::INFINITY,
+        });
         self.visit(self.levels.len() - 1, 0, place, None, &mut nearest);
         nearest
     }
@@ -109,11 +116,17 @@ impl<'a> Neighbours<'a> {
         }
         let below = &self.levels[level - 1];
         let mut order = [(f32::INFINITY, 0usize); FAN];
+        let mut count = 0;
         let end = (first + FAN).min(below.len());
-        for (slot, child) in order.iter_mut().zip(first..end) {
-            *slot = (below[child].distance_squared(from), child);
+        for (child, aabb) in (first..end).zip(&below[first..end]) {
+            let distance = aabb.distance_squared(from);
+            // Most are too far: only the others are worth sorting.
+            if distance < nearest.limit() {
+                order[count] = (distance, child);
+                count += 1;
+            }
         }
-        let order = &mut order[..end - first];
+        let order = &mut order[..count];
         order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         for &(distance, child) in order.iter() {
             if distance >= nearest.limit() {

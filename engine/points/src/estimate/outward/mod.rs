@@ -16,7 +16,7 @@ mod winding;
 
 pub(super) use representatives::Cells;
 
-use super::neighbours::Neighbours;
+use super::neighbours::{Nearest, Neighbours};
 use super::order::Ordered;
 use crate::error::PointsError;
 use glam::Vec3;
@@ -44,6 +44,8 @@ pub(super) struct Outward {
 pub(super) struct Sides<'a> {
     outward: &'a Outward,
     neighbours: Neighbours<'a>,
+    /// To the place of the last question.
+    nearest: Nearest<ASKED>,
 }
 
 impl Outward {
@@ -83,21 +85,23 @@ impl Outward {
         Sides {
             outward: self,
             neighbours: Neighbours::new(&self.positions),
+            nearest: Nearest::within(f32::INFINITY),
         }
     }
 }
 
 impl Sides<'_> {
-    /// A vector on the outer side of the plane through a point.
-    pub(super) fn towards(&self, position: Vec3) -> Vec3 {
+    /// A vector on the outer side of the plane through a point. Questions about points close to one another are fast.
+    pub(super) fn towards(&mut self, position: Vec3) -> Vec3 {
         let Outward {
             bounds,
             positions,
             dipoles,
             spacing,
         } = self.outward;
+        self.nearest = self.neighbours.nearest_to(position, &self.nearest);
         let mut field = Field::default();
-        for &(_, other) in self.neighbours.nearest_to::<ASKED>(position).found() {
+        for &(_, other) in self.nearest.found() {
             let offset = (positions[other as usize] - position) / *spacing;
             field.add(offset, dipoles[other as usize], 0.0);
         }

@@ -22,10 +22,10 @@ const EVIDENCE: f32 = 0.1;
 const ALONE: f32 = 0.125;
 /// Mean cosine to the direction from the middle below which a sheet has no outer side.
 const AWAY: f32 = 0.2;
-/// Pieces above this share of the surface: when they turn, the field is computed anew for the pieces after them.
+/// Pieces above this share of the surface count as large: what they do to the others is looked at too.
 const LARGE: f32 = 0.003;
-/// Large pieces that may turn: a bound on the time of clouds without bodies.
-const LARGE_TURNS_MAX: usize = 32;
+/// Most large pieces, the largest: a bound on the time of clouds without bodies.
+const LARGE_MAX: usize = 32;
 /// Every piece is looked at that often.
 const SWEEPS: usize = 2;
 
@@ -200,7 +200,7 @@ impl Surface<'_> {
         own
     }
 
-    /// The winding number of all.
+    /// The winding number of those whose normals are not zero, at all.
     fn winding(&self, normals: &[Vec3]) -> Vec<f32> {
         let sources: Vec<Source> = normals
             .iter()
@@ -214,44 +214,47 @@ impl Surface<'_> {
         fields.iter().map(|field| field.winding).collect()
     }
 
+    /// The winding number of a piece: at all, if it is large, else at its own members, where it is known.
+    fn reach(&self, piece: &Piece, normals: &[Vec3], own: &[f32], is_large: bool) -> Vec<(usize, f32)> {
+        let members = piece.members.iter().map(|&of| of as usize);
+        if !is_large {
+            return members.map(|of| (of, own[of])).collect();
+        }
+        let mut alone = vec![Vec3::ZERO; normals.len()];
+        members.for_each(|of| alone[of] = normals[of]);
+        self.winding(&alone).into_iter().enumerate().collect()
+    }
+
     /// Turns every piece that brings the winding number closer to a half so, the largest first.
     fn face_out(&self, mut pieces: Vec<Piece>, normals: &mut [Vec3]) {
+        let areas = &self.representatives.areas;
         let mut own = self.own_winding(&pieces, normals);
         let mut all = self.winding(normals);
+        pieces.sort_by(|a, b| b.area.total_cmp(&a.area));
         let part_of = parts(&pieces, normals.len());
-        let alone: Vec<bool> = pieces.iter().map(|piece| self.is_alone(piece, &part_of)).collect();
         let large = LARGE * pieces.iter().map(|piece| piece.area).sum::<f32>();
-        let mut turns_left = LARGE_TURNS_MAX;
-        let mut order: Vec<(Piece, bool)> = pieces.drain(..).zip(alone).collect();
-        order.sort_by(|(a, _), (b, _)| b.area.total_cmp(&a.area));
         for _ in 0..SWEEPS {
-            for (piece, alone) in &order {
+            for (number, piece) in pieces.iter().enumerate() {
+                let is_large = number < LARGE_MAX && piece.area > large;
+                let reach = self.reach(piece, normals, &own, is_large);
                 // What turning it adds to the squares of the errors, over four.
-                let worse: f32 = piece
-                    .members
+                let worse: f32 = reach
                     .iter()
-                    .map(|&of| {
-                        let (own, others) = (own[of as usize], all[of as usize] - own[of as usize]);
-                        self.representatives.areas[of as usize] * own * (HALF - others)
-                    })
+                    .map(|&(at, winding)| areas[at] * winding * (HALF - all[at] + winding))
                     .sum();
                 let faces_out = if worse.abs() > EVIDENCE * HALF * HALF * piece.area {
                     worse > 0.0
                 } else {
-                    !alone || self.faces_away(piece, normals)
+                    !self.is_alone(piece, &part_of) || self.faces_away(piece, normals)
                 };
                 if faces_out {
                     continue;
                 }
+                reach.iter().for_each(|&(at, winding)| all[at] -= 2.0 * winding);
                 for &of in &piece.members {
                     let of = of as usize;
                     normals[of] = -normals[of];
-                    all[of] -= 2.0 * own[of];
                     own[of] = -own[of];
-                }
-                if piece.area > large && turns_left > 0 {
-                    turns_left -= 1;
-                    all = self.winding(normals);
                 }
             }
         }
