@@ -19,7 +19,8 @@ pub const THREADS_DEFAULT: usize = 2;
 /// Memory for what an input keeps, unless the caller says otherwise.
 pub const INPUT_MEMORY_DEFAULT: u64 = 2 << 30;
 
-/// Least memory that brings a cloud into order: two blocks at work, and the counts of coarse cells.
+/// Least memory that brings a cloud into order: two blocks at work, and the counts of coarse cells; or the points that stand for
+/// all while their sides are found, five megabytes.
 pub const ESTIMATE_MEMORY_MIN: u64 = 8_000_000;
 
 /// Most channels of an EXR file: passes, light groups and Cryptomatte ranks of a film's frame are 100 to 300. Only those that

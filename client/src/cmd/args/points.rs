@@ -59,7 +59,7 @@ impl DensityArgs {
 #[derive(Args, Clone, Copy, Debug, Default)]
 #[command(next_help_heading = "Point clouds")]
 pub(crate) struct ReadingArgs {
-    /// Estimate normals from neighbouring points, turned up, out (away from the middle) or to a viewpoint X,Y,Z
+    /// Estimate normals from neighbouring points, turned up, out (of the body they enclose) or to a viewpoint X,Y,Z
     /// [default: up for LAS and LAZ, else out]
     #[arg(long, value_name = "SIDE", num_args = 0..=1, require_equals = true, default_missing_value = "auto", value_parser = facing)]
     estimate_normals: Option<Facing>,

@@ -48,7 +48,8 @@ pub enum Facing {
     Auto,
     /// Up: +y.
     Up,
-    /// Away from the centre of the cloud's box.
+    /// Out of the body that the points enclose; where they enclose none, away from the middle of their box, or the one way for a
+    /// whole sheet.
     Outward,
     /// To a point: world space, such as where the scanner stood.
     Viewpoint([f32; 3]),

@@ -6,6 +6,7 @@
 
 mod neighbours;
 mod order;
+mod outward;
 mod surface;
 
 use crate::cloud::{Cloud, CloudOptions, Facing, Radius};
@@ -14,6 +15,7 @@ use crate::limits;
 use glam::Vec3;
 use neighbours::Neighbours;
 use order::{Census, Dealer, Ordered};
+use outward::Outward;
 use pbgi_core::limits::MORTON_BITS;
 use pbgi_core::{Bounds, MortonCode, PointRecord, PointStream, Quantizer, octahedral};
 use std::ops::Range;
@@ -71,6 +73,8 @@ enum Stage {
     Sorting(Box<Dealer>, usize),
     Blocks {
         ordered: Box<Ordered>,
+        /// Where normals are to face out.
+        outward: Option<Outward>,
         next: u64,
         ready: Vec<Vec<PointRecord>>,
     },
@@ -143,7 +147,12 @@ impl Estimated {
     }
 
     /// Computes the next blocks, one a thread.
-    fn blocks(&self, ordered: &Ordered, next: &mut u64) -> Result<Vec<Vec<PointRecord>>, PointsError> {
+    fn blocks(
+        &self,
+        ordered: &Ordered,
+        outward: Option<&Outward>,
+        next: &mut u64,
+    ) -> Result<Vec<Vec<PointRecord>>, PointsError> {
         let mut ranges = Vec::new();
         while ranges.len() < self.threads && *next < ordered.len() {
             let end = (*next + BLOCK_POINTS).min(ordered.len());
@@ -155,7 +164,7 @@ impl Estimated {
             for (number, range) in ranges.into_iter().enumerate() {
                 let (done, wanted) = (&done, &self.wanted);
                 scope.spawn(move || {
-                    let block = wanted.block(ordered, range);
+                    let block = wanted.block(ordered, outward, range);
                     done.lock()
                         .unwrap_or_else(std::sync::PoisonError::into_inner)
                         .push((number, block));
@@ -170,7 +179,12 @@ impl Estimated {
 }
 
 impl Wanted {
-    fn block(&self, ordered: &Ordered, range: Range<u64>) -> Result<Vec<PointRecord>, PointsError> {
+    fn block(
+        &self,
+        ordered: &Ordered,
+        outward: Option<&Outward>,
+        range: Range<u64>,
+    ) -> Result<Vec<PointRecord>, PointsError> {
         if self.facing.is_none() && self.radius.is_none() {
             let mut block = Vec::new();
             ordered.read(range, &mut block)?;
@@ -179,7 +193,7 @@ impl Wanted {
         let (points, own) = surroundings(ordered, range)?;
         let positions: Vec<Vec3> = points.iter().map(|point| Vec3::from(point.position)).collect();
         let neighbours = Neighbours::new(&positions);
-        let centre = (Vec3::from(self.bounds.min) + Vec3::from(self.bounds.max)) / 2.0;
+        let mut sides = outward.map(Outward::sides);
         let cell = (ordered.quantizer().edge / f64::from(1u32 << MORTON_BITS)) as f32;
         let mut block = Vec::with_capacity(own.len());
         for index in own {
@@ -190,10 +204,10 @@ impl Wanted {
                 None => point.normal(),
                 Some(facing) => {
                     let around = found.iter().map(|&(_, other)| positions[other as usize]);
-                    let towards = match facing {
-                        Facing::Up | Facing::Auto => Vec3::Y,
-                        Facing::Outward => position - centre,
-                        Facing::Viewpoint(eye) => Vec3::from(eye) - position,
+                    let towards = match (facing, &mut sides) {
+                        (Facing::Viewpoint(eye), _) => Vec3::from(eye) - position,
+                        (Facing::Outward, Some(sides)) => sides.towards(position),
+                        _ => Vec3::Y,
                     };
                     let normal = surface::least_spread(around.chain([position]), position);
                     let normal = normal.unwrap_or(towards.normalize_or(Vec3::Y));
@@ -424,23 +438,37 @@ impl PointStream for Estimated {
                 dealer.sort(bucket)?;
                 Stage::Sorting(dealer, bucket + 1)
             }
-            Stage::Sorting(dealer, _) => Stage::Blocks {
-                ordered: Box::new(dealer.finish()),
-                next: 0,
-                ready: Vec::new(),
-            },
+            Stage::Sorting(dealer, _) => {
+                let ordered = dealer.finish();
+                let outward = match self.wanted.facing {
+                    Some(Facing::Outward) => Some(Outward::find(&ordered, &self.wanted.bounds, self.threads)?),
+                    _ => None,
+                };
+                Stage::Blocks {
+                    ordered: Box::new(ordered),
+                    outward,
+                    next: 0,
+                    ready: Vec::new(),
+                }
+            }
             Stage::Blocks {
                 ordered,
+                outward,
                 mut next,
                 mut ready,
             } => {
                 if ready.is_empty() {
-                    ready = self.blocks(&ordered, &mut next)?;
+                    ready = self.blocks(&ordered, outward.as_ref(), &mut next)?;
                 }
                 let block = ready.pop();
                 let more = block.is_some();
                 batch.extend(block.into_iter().flatten());
-                self.stage = Stage::Blocks { ordered, next, ready };
+                self.stage = Stage::Blocks {
+                    ordered,
+                    outward,
+                    next,
+                    ready,
+                };
                 return Ok(more);
             }
             Stage::Broken => return Err(PointsError::Request("the input failed before".to_owned())),

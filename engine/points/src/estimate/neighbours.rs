@@ -64,11 +64,22 @@ impl<'a> Neighbours<'a> {
     /// The `K` points nearest to point `of`, itself left out; fewer if there are no more. Of points equally far, those
     /// that come first in the search.
     pub(super) fn nearest<const K: usize>(&self, of: usize) -> Nearest<K> {
-        let mut nearest = Nearest {
-            found: [(self.bound::<K>(of), 0); K],
-            len: 0,
-        };
-        self.visit(self.levels.len() - 1, 0, of, &mut nearest);
+        let mut nearest = Nearest::within(self.bound::<K>(of));
+        self.visit(self.levels.len() - 1, 0, self.positions[of], Some(of), &mut nearest);
+        nearest
+    }
+
+    /// The `K` points nearest to a place; fewer if there are no more. Those that were nearest to a place nearby shorten the
+    /// search.
+    pub(super) fn nearest_to<const K: usize>(&self, place: Vec3, nearby: &Nearest<K>) -> Nearest<K> {
+        let farthest = nearby.found().iter().fold(0.0, |farthest: f32, &(_, other)| {
+            farthest.max(self.positions[other as usize].distance_squared(place))
+        });
+        let mut nearest = Nearest::within(match nearby.len {
+            len if len == K => farthest.next_up(),
+            _ => f32::INFINITY,
+        });
+        self.visit(self.levels.len() - 1, 0, place, None, &mut nearest);
         nearest
     }
 
@@ -77,10 +88,7 @@ impl<'a> Neighbours<'a> {
         let from = self.positions[of];
         let first = of.saturating_sub(K);
         let end = (of + K + 1).min(self.positions.len());
-        let mut beside = Nearest::<K> {
-            found: [(f32::INFINITY, 0); K],
-            len: 0,
-        };
+        let mut beside = Nearest::<K>::within(f32::INFINITY);
         for other in (first..end).filter(|&other| other != of) {
             beside.offer(self.positions[other].distance_squared(from), other as u32);
         }
@@ -88,13 +96,19 @@ impl<'a> Neighbours<'a> {
         beside.limit().next_up()
     }
 
-    fn visit<const K: usize>(&self, level: usize, index: usize, of: usize, nearest: &mut Nearest<K>) {
-        let from = self.positions[of];
+    fn visit<const K: usize>(
+        &self,
+        level: usize,
+        index: usize,
+        from: Vec3,
+        except: Option<usize>,
+        nearest: &mut Nearest<K>,
+    ) {
         let first = index * FAN;
         if level == 0 {
             let end = (first + FAN).min(self.positions.len());
             for other in first..end {
-                if other != of {
+                if Some(other) != except {
                     nearest.offer(self.positions[other].distance_squared(from), other as u32);
                 }
             }
@@ -102,28 +116,42 @@ impl<'a> Neighbours<'a> {
         }
         let below = &self.levels[level - 1];
         let mut order = [(f32::INFINITY, 0usize); FAN];
+        let mut count = 0;
         let end = (first + FAN).min(below.len());
-        for (slot, child) in order.iter_mut().zip(first..end) {
-            *slot = (below[child].distance_squared(from), child);
+        for (child, aabb) in (first..end).zip(&below[first..end]) {
+            let distance = aabb.distance_squared(from);
+            // Most are too far: only the others are worth sorting.
+            if distance < nearest.limit() {
+                order[count] = (distance, child);
+                count += 1;
+            }
         }
-        let order = &mut order[..end - first];
+        let order = &mut order[..count];
         order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         for &(distance, child) in order.iter() {
             if distance >= nearest.limit() {
                 break;
             }
-            self.visit(level - 1, child, of, nearest);
+            self.visit(level - 1, child, from, except, nearest);
         }
     }
 }
 
 impl<const K: usize> Nearest<K> {
+    /// Of points that are nearer than the root of `squared`.
+    pub(super) fn within(squared: f32) -> Self {
+        Self {
+            found: [(squared, 0); K],
+            len: 0,
+        }
+    }
+
     fn limit(&self) -> f32 {
         self.found[K - 1].0
     }
 
     #[inline]
-    fn offer(&mut self, distance: f32, index: u32) {
+    pub(super) fn offer(&mut self, distance: f32, index: u32) {
         if distance >= self.limit() {
             return;
         }

@@ -4,6 +4,7 @@
 //! Points are counted by coarse cells, dealt out to buckets of consecutive cells that fit the memory, and each bucket is
 //! sorted by itself: the input is read twice, scratch is written twice, and read once before the points are handed out.
 
+use super::outward::Cells;
 use crate::error::PointsError;
 use bytemuck::Zeroable;
 use pbgi_core::limits::MORTON_BITS;
@@ -46,10 +47,12 @@ pub(super) struct Dealer {
     marks: Marks,
 }
 
-/// Codes of the finished order, one every `stride` points.
+/// What is noted of the finished order.
 struct Marks {
+    /// Codes of the points, one every `stride`.
     codes: Vec<u64>,
     stride: u64,
+    cells: Cells,
 }
 
 struct Bucket {
@@ -159,7 +162,7 @@ impl Dealer {
         self.buckets.len()
     }
 
-    /// Sorts one bucket; they may be sorted in any order.
+    /// Sorts one bucket; one after another.
     pub(super) fn sort(&mut self, bucket: usize) -> Result<(), PointsError> {
         let bucket = &mut self.buckets[bucket];
         bucket.flush(&mut self.storage)?;
@@ -193,10 +196,11 @@ impl Marks {
         Self {
             codes: vec![0; points.div_ceil(stride) as usize],
             stride,
+            cells: Cells::new(),
         }
     }
 
-    /// Notes the codes of points that are in their places, from `at` on.
+    /// Notes points that are in their places, from `at` on: all of them, one after another.
     fn note(&mut self, at: u64, points: &[PointRecord], quantizer: &Quantizer) {
         let ahead = at.next_multiple_of(self.stride) - at;
         let marked = points.iter().skip(ahead as usize).step_by(self.stride as usize);
@@ -204,6 +208,7 @@ impl Marks {
         for (code, point) in places.zip(marked) {
             *code = quantizer.code(point.position).0;
         }
+        self.cells.note(at, points, quantizer);
     }
 }
 
@@ -398,6 +403,10 @@ impl Ordered {
         &self.quantizer
     }
 
+    pub(super) fn cells(&self) -> &Cells {
+        &self.marks.cells
+    }
+
     /// Appends the records of `range`.
     pub(super) fn read(&self, range: Range<u64>, points: &mut Vec<PointRecord>) -> Result<(), PointsError> {
         self.storage.read(range, points)
@@ -406,7 +415,9 @@ impl Ordered {
     /// Records among which are all those whose code is in `codes`, and few others.
     pub(super) fn records_around(&self, codes: Range<u64>) -> Range<u64> {
         // The entry before the first one that is not below: points of the range may come before the next entry.
-        let Marks { codes: marks, stride } = &self.marks;
+        let Marks {
+            codes: marks, stride, ..
+        } = &self.marks;
         let first = marks.partition_point(|&code| code < codes.start).saturating_sub(1) as u64;
         let end = marks.partition_point(|&code| code < codes.end) as u64;
         let start = first * stride;
