@@ -22,7 +22,6 @@ pub struct MeshScene {
     lights: Vec<Light>,
     cameras: Vec<Camera>,
     environment: Option<Surroundings>,
-    bounds: Bounds,
     area: f64,
     tracer: Tracer,
 }
@@ -122,7 +121,6 @@ impl MeshScene {
             lights: parts.lights,
             cameras: parts.cameras,
             environment: parts.environment,
-            bounds: tracer.bounds(),
             area,
             tracer,
         }
@@ -130,7 +128,7 @@ impl MeshScene {
 
     /// The exact box of all triangles, world space.
     pub fn bounds(&self) -> Bounds {
-        self.bounds
+        self.tracer.bounds()
     }
 
     /// Area of all triangles, square world units, cut-outs included.
@@ -165,7 +163,7 @@ impl MeshScene {
     /// There is no such camera.
     pub fn camera(&self, index: usize) -> Result<Camera, PointsError> {
         if self.cameras.is_empty() && index == 0 {
-            return Ok(Camera::framing(&self.bounds));
+            return Ok(Camera::framing(&self.bounds()));
         }
         self.cameras.get(index).cloned().ok_or_else(|| {
             let count = self.cameras.len();
@@ -189,7 +187,7 @@ impl MeshScene {
         const ROUNDINGS: f32 = 256.0 * f32::EPSILON / 2.0;
         /// Surfaces of a scene far smaller than its place in the world.
         const EXTENT_SHARE: f32 = 0.1;
-        (position.abs().max_element() + EXTENT_SHARE * self.bounds.diagonal()) * ROUNDINGS
+        (position.abs().max_element() + EXTENT_SHARE * self.bounds().diagonal()) * ROUNDINGS
     }
 
     /// Whether there is surface at this place of a triangle: its opacity reaches the cutoff.

@@ -37,7 +37,7 @@ const WALL_SCALE: f32 = 1.2;
 const WALL_SHARE: f32 = 0.7;
 
 /// Share of its rectangle that a round cluster covers which shows `share` of it. The parts of a sheet lie side by side; of
-/// scattered discs some hide others: as many as chance has it, 1 - exp(-share), within 2 %.
+/// scattered discs some hide others: as many as chance has it, 1 - exp(-share), within 0.03.
 #[inline(always)]
 fn covered_share<F: Floats>(share: F, scattered: f32) -> F {
     /// A share beyond which nothing is open.
@@ -179,7 +179,8 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
             distance,
         };
         let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, direction);
-        let rectangle = (F::splat(4.0) * a * b).max(F::splat(f32::MIN_POSITIVE));
+        let tiny = F::splat(1e-30);
+        let rectangle = (F::splat(4.0) * a * b).max(tiny);
         let covered = covered_share(shown.area / rectangle, shown.scattered);
         let density = (covered * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
         let scale = wall_scale(covered, shown.scattered) * covered.max(F::splat(OPAQUE_SHARE));
@@ -197,7 +198,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let covered = self.cover(&footprint, lanes, thin.then_some(density), weight, visit.path);
         if let Some(covered) = covered {
             // What hides behind more than a rectangle's worth is taken for the unlit insides of a body.
-            let visible = shown.area.min(rectangle);
+            let visible = shown.area.min(rectangle).max(tiny);
             let lit = covered.bits_set().select(covered.light / visible, F::splat(0.0));
             self.radiance = self.radiance + shown.power * lit;
         }
@@ -393,5 +394,20 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let within = ((F::splat(settings.max_dist) - distance + extent) / width).clamp(0.0, 1.0);
         let fade: [f32; LANES] = distance.to_array().map(|distance| (-settings.falloff * distance).exp());
         Some(within * F::from_array(fade))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::ScalarFloats;
+
+    #[test]
+    fn scattered_discs_cover_what_chance_leaves_and_sheets_all_that_they_show() {
+        let covered = |share: f32, scattered| covered_share(ScalarFloats::splat(share), scattered).to_array()[0];
+        for share in [0.0f32, 0.1, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 1e30] {
+            assert!((covered(share, 1.0) - (1.0 - (-share).exp())).abs() < 0.03, "{share}");
+            assert_eq!(covered(share, 0.0), share.min(1.0));
+        }
     }
 }

@@ -29,7 +29,7 @@ pub(crate) struct Surfel {
 pub(crate) struct Layout {
     sizes: Sizes,
     instance: usize,
-    /// The points of that instance, if they are.
+    /// How large the points of that instance are, if they are alike.
     alike: Option<Alike>,
     chart: usize,
     /// Next triangle of the chart.
