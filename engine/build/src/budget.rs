@@ -10,12 +10,13 @@ use crate::octree::subtree::nodes_max;
 use crate::sort::radix::SortedPoints;
 use pbgi_core::limits::MORTON_BITS;
 use pbgi_core::{BuildSettings, NodeRecord, PointRecord};
-use pbgi_store::limits::{RUN_BLOCK_RECORDS, WRITE_BUFFER_BYTES};
+use pbgi_store::limits::{PAGE_WRITER_BYTES, RUN_BLOCK_BYTES, RUN_WRITER_BYTES};
 
 /// One for nodes, one for points.
-const PAGE_BUFFER_BYTES: u64 = 2 * WRITE_BUFFER_BYTES as u64;
+const PAGE_BUFFER_BYTES: u64 = 2 * PAGE_WRITER_BYTES as u64;
 
-const BLOCK_BYTES: u64 = (RUN_BLOCK_RECORDS * size_of::<PointRecord>()) as u64;
+/// The part of a run that points are taken from, and the one behind it, which is read meanwhile.
+const PARTS_PER_RUN: u64 = 2;
 
 /// What each part of a build may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,8 +50,7 @@ impl Budget {
         }
         let sort_bytes = memory_bytes - fixed;
         let points = |bytes_each: u64| usize::try_from((sort_bytes / bytes_each).min(u64::from(u32::MAX)));
-        // One block is the output of an intermediate merge.
-        let fan_in = (sort_bytes / BLOCK_BYTES - 1).max(2);
+        let fan_in = (merge_blocks(sort_bytes) / PARTS_PER_RUN).max(2);
         Ok(Self {
             core_points: points(SortedPoints::bytes(1)).unwrap_or(usize::MAX),
             run_points: points(2 * SortedPoints::bytes(1)).unwrap_or(usize::MAX),
@@ -62,11 +62,16 @@ impl Budget {
 
     /// Blocks that each of `runs` reads at once.
     pub fn blocks_per_read(&self, runs: usize) -> usize {
-        let blocks = self.sort_bytes / BLOCK_BYTES / (runs as u64).max(1);
+        let blocks = merge_blocks(self.sort_bytes) / PARTS_PER_RUN / (runs as u64).max(1);
         usize::try_from(blocks)
             .unwrap_or(usize::MAX)
             .clamp(1, BLOCKS_PER_READ_MAX)
     }
+}
+
+/// Blocks that runs may be read to while one is written.
+fn merge_blocks(sort_bytes: u64) -> u64 {
+    sort_bytes.saturating_sub(RUN_WRITER_BYTES as u64) / RUN_BLOCK_BYTES as u64
 }
 
 /// All write-out queues full: `8^1 + .. + 8^chunk_levels` nodes in each.
@@ -110,7 +115,7 @@ mod tests {
     fn the_default_settings_fit_the_least_memory() {
         let budget = Budget::new(MEMORY_MIN_BYTES, 2, &BuildSettings::default()).unwrap();
         assert!(budget.core_points > 550_000, "{budget:?}");
-        assert!(budget.fan_in > 130, "{budget:?}");
+        assert!(budget.fan_in > 65, "{budget:?}");
     }
 
     #[test]
@@ -133,7 +138,8 @@ mod tests {
     fn reads_stay_within_the_budget_for_any_number_of_runs() {
         let budget = Budget::new(1 << 28, 2, &BuildSettings::default()).unwrap();
         for runs in 1..=budget.fan_in {
-            let bytes = (budget.blocks_per_read(runs) * runs) as u64 * BLOCK_BYTES;
+            let blocks = budget.blocks_per_read(runs) as u64 * runs as u64 * PARTS_PER_RUN;
+            let bytes = blocks * RUN_BLOCK_BYTES as u64 + RUN_WRITER_BYTES as u64;
             assert!(bytes <= budget.sort_bytes, "{runs} runs take {bytes}");
         }
     }

@@ -1,5 +1,6 @@
 //! Bounds and tuned constants of files on disk.
 
+use pbgi_core::PointRecord;
 use std::time::Duration;
 
 /// Records in one file: every index fits a `u32`, and so does the index behind the last record.
@@ -15,15 +16,28 @@ pub const CHECKSUM_BYTES: u64 = 4;
 pub const SECTOR_BYTES: usize = 4096;
 
 /// Bytes a page file gathers before it writes, whole sectors.
-pub const WRITE_BUFFER_BYTES: usize = 1 << 20;
+pub const WRITE_BUFFER_BYTES: usize = 1 << 19;
+
+/// Buffers of a file that is written: one that is filled, one on its way to the disk, and one between them, so that
+/// neither waits.
+pub const FILE_BUFFERS: usize = 3;
+
+/// Memory of a page file that is written, checksums aside.
+pub const PAGE_WRITER_BYTES: usize = FILE_BUFFERS * WRITE_BUFFER_BYTES;
 
 /// Bytes written to a page file after which it is synced in the background: long enough that a disk works at its full
 /// rate, short enough that little is left at the end.
 pub const SYNC_BEHIND_BYTES: u64 = 32 << 20;
 
 /// Records in a block of a run: 256 KiB, large enough to read at the speed of the disk, small enough that 64 MB merge
-/// 190 runs at once.
+/// 65 runs at once, each with two.
 pub const RUN_BLOCK_RECORDS: usize = 8192;
+
+/// Bytes of such a block.
+pub const RUN_BLOCK_BYTES: usize = RUN_BLOCK_RECORDS * size_of::<PointRecord>();
+
+/// Memory of a run that is written.
+pub const RUN_WRITER_BYTES: usize = FILE_BUFFERS * RUN_BLOCK_BYTES;
 
 /// Longest seal of a run read: of a run as long as indices allow.
 pub const SEAL_BYTES_MAX: u64 = 4 << 20;

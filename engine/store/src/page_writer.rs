@@ -2,9 +2,9 @@
 
 use crate::data_file::DataFile;
 use crate::error::StoreError;
+use crate::file_writer::FileWriter;
 use crate::limits::{RECORDS_MAX, WRITE_BUFFER_BYTES};
 use crate::page_header::{PageHeader, PageLayout};
-use crate::sector_buffer::SectorBuffer;
 use crate::volume::{IoMode, Volume};
 use crate::write_behind::WriteBehind;
 use pbgi_core::BuildId;
@@ -12,17 +12,16 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// Writes `[header | pages | checksums]` front to back; the header last, so that an unfinished file never opens.
-/// Memory: one mebibyte, and four bytes a page.
+/// Memory: [`PAGE_WRITER_BYTES`](crate::limits::PAGE_WRITER_BYTES), and four bytes a page.
 pub struct PageFileWriter {
     file: Arc<DataFile>,
+    // Before what syncs it, so that both know the file to the end.
+    writer: FileWriter,
     behind: WriteBehind,
     layout: PageLayout,
-    buffer: SectorBuffer,
-    /// Where the buffer goes.
-    offset: u64,
-    /// Of the pages whose bytes have all been written.
+    /// Of the pages whose bytes have all been handed over.
     checksums: Vec<u32>,
-    /// Of the page that has been written in part, and bytes that it lacks.
+    /// Of the page that has been handed over in part, and bytes that it lacks.
     open_page: (u32, usize),
     slots: u64,
 }
@@ -36,10 +35,9 @@ impl PageFileWriter {
         let file = Arc::new(DataFile::create_new(volume, path, mode)?);
         Ok(Self {
             behind: WriteBehind::new(&file),
+            writer: FileWriter::new(&file, layout.page_offset(0), WRITE_BUFFER_BYTES),
             file,
             layout,
-            buffer: SectorBuffer::with_capacity(WRITE_BUFFER_BYTES),
-            offset: layout.page_offset(0),
             checksums: Vec::new(),
             open_page: (0, layout.page_bytes()),
             slots: 0,
@@ -109,7 +107,7 @@ impl PageFileWriter {
 
     fn append_bytes(&mut self, mut bytes: &[u8]) -> Result<(), StoreError> {
         while !bytes.is_empty() {
-            bytes = self.buffer.append(bytes);
+            bytes = self.writer.buffer().append(bytes);
             self.write_if_full()?;
         }
         Ok(())
@@ -117,22 +115,30 @@ impl PageFileWriter {
 
     fn append_zeroes(&mut self, mut count: usize) -> Result<(), StoreError> {
         while count > 0 {
-            count = self.buffer.append_zeroes(count);
+            count = self.writer.buffer().append_zeroes(count);
             self.write_if_full()?;
         }
         Ok(())
     }
 
     fn write_if_full(&mut self) -> Result<(), StoreError> {
-        if self.buffer.room() == 0 {
-            self.write_buffer()
-        } else {
-            Ok(())
+        if self.writer.buffer().room() > 0 {
+            return Ok(());
         }
+        self.sum_buffer();
+        let handed = self.writer.hand_over();
+        self.or_that_of_a_sync(handed)?;
+        self.behind.wrote(WRITE_BUFFER_BYTES as u64)
     }
 
-    fn write_buffer(&mut self) -> Result<(), StoreError> {
-        let mut rest = self.buffer.bytes();
+    /// A file that a sync has abandoned: the sync's own error says more.
+    fn or_that_of_a_sync(&mut self, written: Result<(), StoreError>) -> Result<(), StoreError> {
+        written.or_else(|error| self.behind.settle().and(Err(error)))
+    }
+
+    /// Goes on with the checksums of pages.
+    fn sum_buffer(&mut self) {
+        let mut rest = self.writer.buffer().bytes();
         while !rest.is_empty() {
             let (checksum, lacks) = self.open_page;
             let (part, tail) = rest.split_at(lacks.min(rest.len()));
@@ -143,15 +149,6 @@ impl PageFileWriter {
             }
             rest = tail;
         }
-        self.file
-            .write_at(self.offset, self.buffer.bytes())
-            // A file that a sync has abandoned: the sync's own error says more.
-            .or_else(|error| self.behind.settle().and(Err(error)))?;
-        let written = self.buffer.bytes().len() as u64;
-        self.behind.wrote(written)?;
-        self.offset += written;
-        self.buffer.clear();
-        Ok(())
     }
 
     /// Writes what is left, the checksums and the header, and makes them durable. Returns the length of the file.
@@ -160,15 +157,14 @@ impl PageFileWriter {
     /// As [`Self::append`].
     pub fn finish(mut self, build_id: BuildId) -> Result<u64, StoreError> {
         let end = self.layout.page_offset(self.layout.page_count(self.slots));
-        let filled = self.offset + self.buffer.bytes().len() as u64;
-        self.append_zeroes((end - filled) as usize)?;
-        if !self.buffer.bytes().is_empty() {
-            self.write_buffer()?;
-        }
+        self.append_zeroes((end - self.writer.end()) as usize)?;
+        self.sum_buffer();
+        let written = self.writer.finish();
+        self.or_that_of_a_sync(written)?;
         self.behind.settle()?;
         let table: &[u8] = bytemuck::cast_slice(&self.checksums);
         if !table.is_empty() {
-            self.file.write_at(self.offset, table)?;
+            self.file.write_at(end, table)?;
         }
         let header = PageHeader {
             layout: self.layout,

@@ -7,9 +7,7 @@
 use crate::data_file::DataFile;
 use crate::error::StoreError;
 use crate::limits::{RUN_BLOCK_RECORDS, SEAL_BYTES_MAX};
-use crate::page_header::check_sum;
 use crate::scratch::ScratchDir;
-use crate::sector_buffer::SectorBuffer;
 use crate::volume::{IoMode, Volume};
 use pbgi_core::PointRecord;
 use std::ffi::OsStr;
@@ -24,7 +22,6 @@ const SEAL_SUFFIX: &str = ".seal";
 const SEAL_MAGIC: [u8; 8] = *b"\x89PBGIrun";
 const DIGITS: usize = 6;
 const RECORD_BYTES: u64 = size_of::<PointRecord>() as u64;
-const BLOCK_BYTES: usize = RUN_BLOCK_RECORDS * size_of::<PointRecord>();
 
 /// Whether a file in a scratch folder is a run or its seal.
 pub(crate) fn is_run_name(name: &OsStr) -> bool {
@@ -53,7 +50,7 @@ fn seal_path(run: &Path) -> PathBuf {
 /// A finished run. Dropping it deletes the file.
 pub struct Run {
     number: u64,
-    file: DataFile,
+    file: Arc<DataFile>,
     volume: Arc<dyn Volume>,
     records: u64,
     checksums: Vec<u32>,
@@ -61,6 +58,35 @@ pub struct Run {
 }
 
 impl Run {
+    /// Creates the file of run `number` in `scratch`, for whoever fills it and [completes](Self::complete) it.
+    pub(crate) fn create(scratch: &ScratchDir, number: u64) -> Result<Self, StoreError> {
+        let path = run_path(scratch.path(), number);
+        let file = DataFile::create_new(scratch.volume(), &path, IoMode::Direct)?;
+        Ok(Self {
+            number,
+            file: Arc::new(file),
+            volume: scratch.volume().clone(),
+            records: 0,
+            checksums: Vec::new(),
+            sealed: false,
+        })
+    }
+
+    /// Takes note of what has been written to the file.
+    pub(crate) fn complete(&mut self, bytes: u64, checksums: Vec<u32>) {
+        self.records = bytes / RECORD_BYTES;
+        self.checksums = checksums;
+    }
+
+    pub(crate) fn file(&self) -> &Arc<DataFile> {
+        &self.file
+    }
+
+    /// That of a block.
+    pub(crate) fn checksum(&self, block: usize) -> u32 {
+        self.checksums[block]
+    }
+
     /// Opens run `number` of a folder that another process left, and what its writer noted on its seal; `None` if there is
     /// no such run, or no whole one. Blocks are checked when they are read.
     pub(crate) fn reopen(scratch: &ScratchDir, number: u64) -> Option<(Self, Vec<u8>)> {
@@ -72,7 +98,7 @@ impl Run {
         let (records, note, checksums) = decode_seal(&bytes)?;
         let run = Self {
             number,
-            file: DataFile::open(scratch.volume(), &path).ok()?,
+            file: Arc::new(DataFile::open(scratch.volume(), &path).ok()?),
             volume: scratch.volume().clone(),
             records,
             checksums,
@@ -95,7 +121,7 @@ impl Run {
     }
 
     /// Writes the seal, with a note for whoever goes on from here.
-    fn seal(&mut self, note: &[u8]) -> Result<(), StoreError> {
+    pub(crate) fn seal(&mut self, note: &[u8]) -> Result<(), StoreError> {
         let path = seal_path(self.file.path());
         // Before it is written: a torn one is removed as well.
         self.sealed = true;
@@ -152,133 +178,4 @@ fn decode_seal(bytes: &[u8]) -> Option<(u64, Vec<u8>, Vec<u32>)> {
     let (note, table) = rest.split_at_checked(note_length)?;
     let checksums = table.as_chunks::<4>().0.iter().map(|sum| u32::from_le_bytes(*sum));
     Some((u64::from_le_bytes(*records), note.to_owned(), checksums.collect()))
-}
-
-/// Writes a run, block by block.
-pub struct RunWriter {
-    run: Run,
-    block: SectorBuffer,
-}
-
-impl RunWriter {
-    /// Creates run `number` in `scratch`; numbers are used once.
-    ///
-    /// # Errors
-    /// [`StoreError::NoSpace`], [`StoreError::Io`].
-    pub fn create(scratch: &ScratchDir, number: u64) -> Result<Self, StoreError> {
-        let path = run_path(scratch.path(), number);
-        let run = Run {
-            number,
-            file: DataFile::create_new(scratch.volume(), &path, IoMode::Direct)?,
-            volume: scratch.volume().clone(),
-            records: 0,
-            checksums: Vec::new(),
-            sealed: false,
-        };
-        Ok(Self {
-            run,
-            block: SectorBuffer::with_capacity(BLOCK_BYTES),
-        })
-    }
-
-    /// Appends points; the caller sees to the order.
-    ///
-    /// # Errors
-    /// [`StoreError::NoSpace`], [`StoreError::Io`], [`StoreError::Abandoned`].
-    pub fn append(&mut self, points: &[PointRecord]) -> Result<(), StoreError> {
-        let mut bytes: &[u8] = bytemuck::cast_slice(points);
-        while !bytes.is_empty() {
-            // A block is a whole number of points.
-            bytes = self.block.append(bytes);
-            if self.block.room() == 0 {
-                self.write_block()?;
-            }
-        }
-        Ok(())
-    }
-
-    fn write_block(&mut self) -> Result<(), StoreError> {
-        let bytes = self.block.bytes();
-        self.run.checksums.push(crc32c::crc32c(bytes));
-        self.run.file.write_at(self.run.bytes(), bytes)?;
-        self.run.records += bytes.len() as u64 / RECORD_BYTES;
-        self.block.clear();
-        Ok(())
-    }
-
-    /// Writes what is left.
-    ///
-    /// # Errors
-    /// As [`Self::append`].
-    pub fn finish(mut self) -> Result<Run, StoreError> {
-        if !self.block.bytes().is_empty() {
-            self.write_block()?;
-        }
-        Ok(self.run)
-    }
-
-    /// As [`Self::finish`], and seals the run, so that [`ScratchDir::sealed_runs`] finds it after the death of this
-    /// process. The system's memory outlives the process; a power loss is told by the checksums.
-    ///
-    /// # Errors
-    /// As [`Self::append`].
-    pub fn finish_sealed(self, note: &[u8]) -> Result<Run, StoreError> {
-        let mut run = self.finish()?;
-        run.seal(note)?;
-        Ok(run)
-    }
-}
-
-/// Reads a run from front to back, some blocks at a time, and deletes it on drop.
-pub struct RunReader {
-    run: Run,
-    /// What was read last.
-    blocks: SectorBuffer,
-    blocks_per_read: usize,
-    blocks_read: usize,
-}
-
-impl RunReader {
-    /// Starts at the first record. A read takes `blocks_per_read` blocks of [`RUN_BLOCK_RECORDS`].
-    pub fn new(run: Run, blocks_per_read: usize) -> Self {
-        Self {
-            run,
-            blocks: SectorBuffer::default(),
-            blocks_per_read: blocks_per_read.max(1),
-            blocks_read: 0,
-        }
-    }
-
-    /// What [`Self::advance`] read last.
-    #[inline]
-    pub fn records(&self) -> &[PointRecord] {
-        self.blocks.records()
-    }
-
-    /// Goes on to the next records; none at the end.
-    ///
-    /// # Errors
-    /// [`StoreError::Corrupt`], [`StoreError::Io`].
-    pub fn advance(&mut self) -> Result<(), StoreError> {
-        let first = self.blocks_read * RUN_BLOCK_RECORDS;
-        let left = self
-            .run
-            .records
-            .saturating_sub(first as u64)
-            .min((self.blocks_per_read * RUN_BLOCK_RECORDS) as u64);
-        let bytes = self.blocks.resize((left * RECORD_BYTES) as usize);
-        if bytes.is_empty() {
-            return Ok(());
-        }
-        let place = || format!("run at record {first}");
-        self.run.file.read_at(first as u64 * RECORD_BYTES, bytes, &place)?;
-        for block in bytes.chunks(BLOCK_BYTES) {
-            let expected = self.run.checksums[self.blocks_read];
-            if crc32c::crc32c(block) != expected {
-                check_sum(self.run.file.path(), &place(), block, expected)?;
-            }
-            self.blocks_read += 1;
-        }
-        Ok(())
-    }
 }

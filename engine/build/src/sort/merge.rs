@@ -11,7 +11,10 @@ const ENDED: u64 = u64::MAX;
 
 /// Merges runs. Runs must be given in the order of their input: of equal codes, that of the earlier run comes first.
 pub struct Merge {
-    runs: Vec<Cursor>,
+    /// Their files stay until the merge goes: should this process die, the next one needs them.
+    runs: RunReader,
+    /// For each run, which point of its part in memory is next.
+    next: Vec<usize>,
     /// Code of the next point of each run, apart from the runs so that comparing touches little memory.
     codes: Vec<u64>,
     /// `losers[i]`, i >= 1: the run that lost the comparison at inner node i; its children are nodes 2 i and 2 i + 1,
@@ -21,24 +24,6 @@ pub struct Merge {
     quantizer: Quantizer,
 }
 
-/// A run and where in its part in memory the merge is. The file stays until the merge goes: should this process die, the next one needs it.
-struct Cursor {
-    reader: RunReader,
-    next: usize,
-}
-
-impl Cursor {
-    /// The next point, read if it has to be; `None` at the end.
-    #[inline]
-    fn front(&mut self) -> Result<Option<&PointRecord>, StoreError> {
-        if self.next == self.reader.records().len() {
-            self.next = 0;
-            self.reader.advance()?;
-        }
-        Ok(self.reader.records().get(self.next))
-    }
-}
-
 impl Merge {
     /// Starts reading all runs, `blocks_per_read` blocks of each at a time.
     ///
@@ -46,18 +31,15 @@ impl Merge {
     /// Scratch cannot be read.
     pub fn new(runs: Vec<Run>, blocks_per_read: usize, quantizer: Quantizer) -> Result<Self, StoreError> {
         let mut merge = Self {
+            next: vec![0; runs.len()],
             codes: vec![ENDED; runs.len()],
             losers: vec![0; runs.len()],
             winner: 0,
-            runs: Vec::with_capacity(runs.len()),
+            runs: RunReader::new(runs, blocks_per_read)?,
             quantizer,
         };
-        for (index, run) in runs.into_iter().enumerate() {
-            merge.runs.push(Cursor {
-                reader: RunReader::new(run, blocks_per_read),
-                next: 0,
-            });
-            merge.load_code(index)?;
+        for run in 0..merge.codes.len() {
+            merge.load_code(run)?;
         }
         merge.play_all();
         Ok(merge)
@@ -71,9 +53,8 @@ impl Merge {
         if code == ENDED {
             return Ok(None);
         }
-        let cursor = &mut self.runs[run];
-        let point = cursor.reader.records()[cursor.next];
-        cursor.next += 1;
+        let point = self.runs.records(run)[self.next[run]];
+        self.next[run] += 1;
         self.load_code(run)?;
         self.replay(run);
         Ok(Some((code, point)))
@@ -81,7 +62,11 @@ impl Merge {
 
     #[inline]
     fn load_code(&mut self, run: usize) -> Result<(), StoreError> {
-        let front = self.runs[run].front()?;
+        if self.next[run] == self.runs.records(run).len() {
+            self.next[run] = 0;
+            self.runs.advance(run)?;
+        }
+        let front = self.runs.records(run).get(self.next[run]);
         self.codes[run] = front.map_or(ENDED, |point| self.quantizer.code(point.position).0);
         Ok(())
     }
@@ -93,7 +78,7 @@ impl Merge {
 
     /// Plays every match, from the leaves up.
     fn play_all(&mut self) {
-        let count = self.runs.len();
+        let count = self.codes.len();
         let mut winners = vec![0; 2 * count];
         for run in 0..count {
             winners[count + run] = run;
@@ -109,7 +94,7 @@ impl Merge {
     #[inline]
     fn replay(&mut self, run: usize) {
         let mut winner = run;
-        let mut node = (self.runs.len() + run) / 2;
+        let mut node = (self.codes.len() + run) / 2;
         while node > 0 {
             let loser = self.losers[node];
             if self.before(loser, winner) {

@@ -286,7 +286,7 @@ impl Sorter {
             hash: UnorderedHash::default(),
         };
         group.iter().for_each(|span| content.hash.merge(span.content.hash));
-        let blocks = self.budget.blocks_per_read(group.len() + 1);
+        let blocks = self.budget.blocks_per_read(group.len());
         let mut merge = Merge::new(group.into_iter().map(|span| span.run).collect(), blocks, *quantizer)?;
         let mut writer = RunWriter::create(scratch, self.number())?;
         let mut done = 0u64;

@@ -1,9 +1,12 @@
 //! Operation 1 fails, then 2, ... until the workload runs clean: no wrong file, no leftover, and the next try succeeds.
 
-use crate::support::{names, write};
+use crate::support::{names, point, write};
 use nix::errno::Errno;
+use pbgi_store::limits::RUN_BLOCK_RECORDS;
 use pbgi_store::testsuite::{CrashVolume, FaultPlan, FaultScope, FaultVolume};
-use pbgi_store::{AtomicFile, DataFile, IoMode, Overwrite, Scene, StoreError, Volume, sweep_temporaries};
+use pbgi_store::{
+    AtomicFile, DataFile, IoMode, Overwrite, RunWriter, Scene, ScratchDir, StoreError, Volume, sweep_temporaries,
+};
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
@@ -123,6 +126,34 @@ fn after_a_failed_write_or_sync_a_file_takes_no_more() {
         for later in [file.sync(), file.write_at(0, b"again")] {
             assert!(matches!(later, Err(StoreError::Abandoned { .. })));
         }
+    }
+}
+
+/// A run of six blocks: but for the last, they are written behind the caller's back.
+#[test]
+fn a_run_tells_of_any_write_that_failed_and_goes() {
+    let points: Vec<_> = (0..6 * RUN_BLOCK_RECORDS as u32 - 1).map(point).collect();
+    for at in 1.. {
+        let plan = FaultPlan {
+            at,
+            persistent: false,
+            errno: Errno::ENOSPC,
+            scope: FaultScope::Space,
+        };
+        let (_, fault, volume) = faulty(plan);
+        let written = ScratchDir::create(&volume, Path::new("/")).and_then(|scratch| {
+            let mut writer = RunWriter::create(&scratch, 0)?;
+            points.chunks(1000).try_for_each(|some| writer.append(some))?;
+            writer.finish()
+        });
+        if fault.injected() == 0 {
+            assert_eq!(written.unwrap().records(), points.len() as u64);
+            // The folder, the file, six blocks.
+            assert_eq!(at, 9);
+            return;
+        }
+        assert!(matches!(written, Err(StoreError::NoSpace { .. })), "operation {at}");
+        assert!(names(volume.as_ref(), Path::new("/")).is_empty(), "operation {at}");
     }
 }
 

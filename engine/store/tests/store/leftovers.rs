@@ -163,14 +163,11 @@ fn a_run_comes_back_in_order_and_is_deleted() {
         points.chunks(1000).for_each(|some| writer.append(some).unwrap());
         let run = writer.finish().unwrap();
         assert_eq!(run.records(), count as u64);
-        let mut reader = RunReader::new(run, 2);
+        let mut reader = RunReader::new(vec![run], 2).unwrap();
         let mut read = Vec::new();
-        loop {
-            reader.advance().unwrap();
-            if reader.records().is_empty() {
-                break;
-            }
-            read.extend_from_slice(reader.records());
+        while !reader.records(0).is_empty() {
+            read.extend_from_slice(reader.records(0));
+            reader.advance(0).unwrap();
         }
         assert!(read == points);
         drop(reader);
@@ -190,6 +187,6 @@ fn a_damaged_run_is_detected() {
     let mut bytes = fs::read(&file).unwrap();
     bytes[1000] ^= 4;
     fs::write(&file, &bytes).unwrap();
-    let error = RunReader::new(run, 1).advance().unwrap_err();
+    let error = RunReader::new(vec![run], 1).err().unwrap();
     assert!(matches!(error, StoreError::Corrupt { .. }), "{error}");
 }
