@@ -115,7 +115,7 @@ mod tests {
     fn the_default_settings_fit_the_least_memory() {
         let budget = Budget::new(MEMORY_MIN_BYTES, 2, &BuildSettings::default()).unwrap();
         assert!(budget.core_points > 550_000, "{budget:?}");
-        assert!(budget.fan_in > 65, "{budget:?}");
+        assert!(budget.fan_in > 55, "{budget:?}");
     }
 
     #[test]

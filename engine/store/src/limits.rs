@@ -16,7 +16,7 @@ pub const CHECKSUM_BYTES: u64 = 4;
 pub const SECTOR_BYTES: usize = 4096;
 
 /// Bytes a page file gathers before it writes, whole sectors.
-pub const WRITE_BUFFER_BYTES: usize = 1 << 19;
+pub const WRITE_BUFFER_BYTES: usize = 1 << 20;
 
 /// Buffers of a file that is written: one that is filled, one on its way to the disk, and one between them, so that
 /// neither waits.
@@ -30,7 +30,7 @@ pub const PAGE_WRITER_BYTES: usize = FILE_BUFFERS * WRITE_BUFFER_BYTES;
 pub const SYNC_BEHIND_BYTES: u64 = 32 << 20;
 
 /// Records in a block of a run: 256 KiB, large enough to read at the speed of the disk, small enough that 64 MB merge
-/// 65 runs at once, each with two.
+/// 60 runs at once, each with two.
 pub const RUN_BLOCK_RECORDS: usize = 8192;
 
 /// Bytes of such a block.
