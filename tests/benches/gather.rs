@@ -1,7 +1,7 @@
 //! Error against time, of the gather and of ray casting the mesh, on the same receivers in one run and on one core.
 //!
-//! `cargo bench -p pbgi-tests --bench gather -- [spheres] [cornell] [sponza] [city] [forest]` (all by default; scenes whose files are
-//! absent are skipped, loudly). What it prints are the tables of `docs/gathering.md`. Errors are against rays at the mesh: two
+//! `cargo bench -p pbgi-tests --bench gather -- [spheres] [cornell] [sponza] [street] [glade] [city] [forest]` (all by default; scenes
+//! whose files are absent are skipped, loudly). What it prints are the tables of `docs/gathering.md`. Errors are against rays at the mesh: two
 //! independent references per receiver, whose noise drops out of the mean of the product of both differences.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark asserts")]
@@ -9,7 +9,7 @@
 use glam::Vec3;
 use pbgi_build::{BuildRequest, build};
 use pbgi_core::{BuildSettings, SceneInfo, ShadeSettings};
-use pbgi_points::{Camera, Density, GBuffer, InputOptions, Kind, MeshScene, ProceduralScene, open_input};
+use pbgi_points::{Camera, Density, GBuffer, InputOptions, Kind, MeshScene, ProceduralScene, ViewDensity, open_input};
 use pbgi_shade::{ArraySource, Receiver, Shaded, Shader};
 use pbgi_store::Overwrite;
 use pbgi_tests::load;
@@ -40,6 +40,9 @@ const SETTINGS: [(f32, u32, f32); 9] = [
 ];
 /// Rays along one edge of the grid.
 const RAY_SIDES: [u32; 4] = [4, 8, 16, 32];
+
+/// Scenes.
+const NAMES: [&str; 7] = ["spheres", "cornell", "sponza", "street", "glade", "city", "forest"];
 
 /// One line of the table.
 struct Row {
@@ -106,9 +109,18 @@ fn mean(rgb: [f32; 3]) -> f32 {
     (rgb[0] + rgb[1] + rgb[2]) / 3.0
 }
 
+/// What is shaded.
+struct Scene {
+    name: String,
+    /// The mesh.
+    file: PathBuf,
+    density: Density,
+    camera: usize,
+}
+
 /// Receivers in whole groups, spread over the picture.
-fn receivers(mesh: &MeshScene) -> Vec<Vec<Receiver>> {
-    let camera = mesh.camera(0).unwrap_or_else(|_| Camera::framing(&mesh.bounds()));
+fn receivers(mesh: &MeshScene, camera: usize) -> Vec<Vec<Receiver>> {
+    let camera = mesh.camera(camera).unwrap_or_else(|_| Camera::framing(&mesh.bounds()));
     let (width, height) = SIZE;
     let frame = GBuffer::render(mesh, &camera, width, height).unwrap();
     let mut groups = Vec::new();
@@ -214,19 +226,20 @@ fn ray_rows(mesh: &MeshScene, receivers: &[Receiver], truth: &Truth, side: u32) 
     ]
 }
 
-fn measure(name: &str, file: &Path, points: u64, scratch: &Path) {
+fn measure(scene: &Scene, scratch: &Path) {
+    let Scene { name, file, .. } = scene;
     let mesh = MeshScene::load(file).unwrap();
-    let groups = receivers(&mesh);
+    let groups = receivers(&mesh, scene.camera);
     let all: Vec<Receiver> = groups.iter().flatten().copied().collect();
     let truth = Truth::new(&mesh, &all);
 
     let options = InputOptions {
-        density: Density::Points(points),
-        memory_bytes: 4_000_000_000,
+        density: scene.density,
+        memory_bytes: 8_000_000_000,
         scratch_dir: scratch.to_owned(),
         ..InputOptions::default()
     };
-    let mut input = open_input(&[file.to_owned()], &options).unwrap();
+    let mut input = open_input(std::slice::from_ref(file), &options).unwrap();
     let output = scratch.join(format!("{name}.pbgi"));
     let request = BuildRequest {
         output: output.clone(),
@@ -268,24 +281,45 @@ fn measure(name: &str, file: &Path, points: u64, scratch: &Path) {
     }
 }
 
-/// The scene's mesh, its points, or why it is skipped.
-fn scene(name: &str, scratch: &Path) -> Option<(PathBuf, u64)> {
-    match name {
-        "spheres" => Some((spheres(scratch), 1_000_000)),
-        "cornell" => Some((pbgi_tests::shared("reference/cornell.glb")?, 2_000_000)),
-        "sponza" => Some((pbgi_tests::shared("data/sponza/sponza_lit.gltf")?, 5_500_000)),
-        "city" | "forest" => {
-            let kind: Kind = name.parse().unwrap();
-            let path = scratch.join(format!("{name}.glb"));
-            ProceduralScene::new(kind, 2_000_000, 1)
-                .unwrap()
-                .write_glb(&path)
-                .unwrap();
-            // Windows lie 0.3 deep: the distance between points is below half of that.
-            Some((path, 16_000_000))
-        }
-        _ => panic!("{name:?} is no scene: choose spheres, cornell, sponza, city or forest"),
-    }
+/// A scene by its name; `None` if its file is absent.
+fn scene(name: &str, scratch: &Path) -> Option<Scene> {
+    let procedural = |kind: Kind, size: u64| {
+        let path = scratch.join(format!("{name}.glb"));
+        let scene = ProceduralScene::new(kind, size, 1).unwrap();
+        scene.write_glb(&path).unwrap();
+        path
+    };
+    let seen = |camera| {
+        Density::View(ViewDensity {
+            camera,
+            size: [SIZE.0, SIZE.1],
+            pixels: 1.0,
+            floor: None,
+            ceiling: None,
+        })
+    };
+    let (file, density, camera) = match name {
+        "spheres" => (spheres(scratch), Density::Points(1_000_000), 0),
+        "cornell" => (
+            pbgi_tests::shared("reference/cornell.glb")?,
+            Density::Points(2_000_000),
+            0,
+        ),
+        "sponza" => (pbgi_tests::shared("data/sponza/sponza_lit.gltf")?, seen(0), 0),
+        // 1.6 million triangles and 10,000 trees, before the eyes of somebody who walks there.
+        "street" => (procedural(Kind::City, 48_000_000), seen(1), 1),
+        "glade" => (procedural(Kind::Forest, 150_000_000), seen(1), 1),
+        // From afar. Windows lie 0.3 deep: the distance between points is below half of that.
+        "city" => (procedural(Kind::City, 2_000_000), Density::Points(16_000_000), 0),
+        "forest" => (procedural(Kind::Forest, 2_000_000), Density::Points(16_000_000), 0),
+        _ => panic!("{name:?} is no scene: choose {}", NAMES.join(", ")),
+    };
+    Some(Scene {
+        name: name.to_owned(),
+        file,
+        density,
+        camera,
+    })
 }
 
 /// 64 spheres over a ground of 20 x 20, half of them touching it, under a sun: the scene of `truth.rs` in pbgi-shade, as a
@@ -347,9 +381,7 @@ fn day() -> u64 {
 fn main() {
     let given: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with("--")).collect();
     let names = if given.is_empty() {
-        ["spheres", "cornell", "sponza", "city", "forest"]
-            .map(str::to_owned)
-            .to_vec()
+        NAMES.map(str::to_owned).to_vec()
     } else {
         given
     };
@@ -363,8 +395,8 @@ fn main() {
     );
     let scratch = tempfile::tempdir().unwrap();
     for name in &names {
-        if let Some((file, points)) = scene(name, scratch.path()) {
-            measure(name, &file, points, scratch.path());
+        if let Some(scene) = scene(name, scratch.path()) {
+            measure(&scene, scratch.path());
         }
     }
 }

@@ -79,8 +79,8 @@ pub const INSTANCE_GROUP: usize = 8;
 /// Placed triangles of a mesh up to which it is copied rather than placed.
 pub const COPIED_TRIANGLES_MAX: usize = 100_000;
 
-/// Most patches of a procedural scene that are written as triangles: a gigabyte.
-pub const GLB_PATCHES_MAX: u64 = 1 << 23;
+/// Most patches of a procedural scene that are written as triangles: two gigabytes.
+pub const GLB_PATCHES_MAX: u64 = 1 << 24;
 
 /// Most placed meshes in a scene.
 pub const INSTANCES_MAX: usize = 1 << 22;

@@ -5,6 +5,7 @@
 
 mod shapes;
 
+use crate::camera::Camera;
 use crate::error::PointsError;
 use crate::glb::{GlbMesh, GlbScene};
 use crate::limits;
@@ -107,7 +108,8 @@ impl ProceduralScene {
         Ok(scene)
     }
 
-    /// Writes the scene's triangles, materials, sun and a camera as a GLB file.
+    /// Writes the scene's triangles, materials, sun and cameras as a GLB file: one that sees all of it, and for a city and a
+    /// forest one at the height of a walker's eyes.
     ///
     /// # Errors
     /// A scene too large for that, a failing disk.
@@ -148,7 +150,10 @@ impl ProceduralScene {
             }
         }
         scene.sun(SUN, -TO_SUN);
-        scene.camera(&crate::Camera::framing(&self.bounds));
+        scene.camera(&Camera::framing(&self.bounds));
+        if let Some(camera) = self.kind.walker(self.units) {
+            scene.camera(&camera);
+        }
         let bytes = scene.finish("pbgi generate");
         write_file(path, |file| file.write_all(&bytes))
     }

@@ -1,6 +1,7 @@
 //! What the procedural scenes are made of: flat patches, unit by unit, each unit from its number and the seed alone.
 
 use super::Kind;
+use crate::camera::Camera;
 use glam::{Vec2, Vec3};
 use std::f32::consts::{PI, TAU};
 
@@ -129,14 +130,35 @@ impl Kind {
             Self::Tighten => hair(&mut random, patches),
         }
     }
+
+    /// The view of a walker who stands in the middle, between the lots; `None` where nobody could walk.
+    pub(super) fn walker(self, units: u64) -> Option<Camera> {
+        const EYE: f32 = 1.7;
+        const FOV_Y: f32 = 0.9;
+        let edge = match self {
+            Self::City => LOT_EDGE,
+            Self::Forest => GLADE_EDGE,
+            Self::Tree | Self::Tighten => return None,
+        };
+        let side = lots_along_edge(units);
+        let crossing = lot(side / 2 * (side + 1), units, edge);
+        let eye = Vec3::new(crossing.x, EYE, crossing.y);
+        // Along the way, a little across it and up.
+        Some(Camera::look_at(eye, eye + Vec3::new(0.25, 0.15, -1.0), FOV_Y))
+    }
 }
 
 const LOT_EDGE: f32 = 24.0;
 const GLADE_EDGE: f32 = 6.0;
 
+/// Lots along an edge of the square that they make.
+fn lots_along_edge(units: u64) -> u64 {
+    (units as f64).sqrt().ceil().max(1.0) as u64
+}
+
 /// Lower corner of a lot on a square of lots around the origin.
 fn lot(index: u64, units: u64, edge: f32) -> Vec2 {
-    let side = (units as f64).sqrt().ceil().max(1.0) as u64;
+    let side = lots_along_edge(units);
     let place = Vec2::new((index % side) as f32, (index / side) as f32);
     (place - Vec2::splat(side as f32 / 2.0)) * edge
 }
