@@ -1,5 +1,6 @@
 //! From points to clusters: the sums that make a node, added point by point in leaves and child by child above.
 
+use crate::coverage::Coverage;
 use crate::limits::HALF_MAX;
 use crate::morton::Quantizer;
 use crate::node::NodeAttributes;
@@ -10,7 +11,7 @@ use crate::sh::{SH_TERMS, band, project_cosine};
 use crate::voxel::Voxel;
 use glam::{DMat3, DVec3, Vec3};
 
-/// Sums over the points of a voxel. Everything is additive, so a parent is the sum of its children; sums stay in f64 until
+/// Sums over the points of a voxel. All but what is covered is additive, so a parent is the sum of its children; sums stay in f64 until
 /// [`Self::finalize`] packs them, and packed values are never summed again.
 #[derive(Clone, Debug)]
 pub struct ClusterAccumulator {
@@ -27,6 +28,7 @@ pub struct ClusterAccumulator {
     normal_moment: [f64; 6],
     /// Light of the front and of the back.
     light: [LightSums; 2],
+    coverage: Coverage,
     radius_max: f32,
     point_count: u64,
 }
@@ -59,6 +61,7 @@ impl Default for ClusterAccumulator {
             normal: DVec3::ZERO,
             normal_moment: [0.0; 6],
             light: [LightSums::default(); 2],
+            coverage: Coverage::default(),
             radius_max: 0.0,
             point_count: 0,
         }
@@ -92,6 +95,7 @@ impl ClusterAccumulator {
         let normal = normal.as_dvec3();
         let spread = radius * radius / 4.0;
         self.area += area;
+        self.coverage.add(point, area);
         self.first_moment += position * area;
         self.normal += normal * area;
         let outer_position = outer(position);
@@ -109,8 +113,10 @@ impl ClusterAccumulator {
         self.point_count += 1;
     }
 
-    /// Adds the sums of a child. Call in octant order: the result then depends on the points alone.
-    pub fn merge(&mut self, child: &Self) {
+    /// Adds the sums of the child in `octant`, once [`Self::finalize`] has seen it. Call in octant order: the result then depends
+    /// on the points alone.
+    pub fn merge(&mut self, octant: u32, child: &Self) {
+        self.coverage.merge(octant, &child.coverage);
         for (term, other) in self.sh.iter_mut().zip(&child.sh) {
             for (value, add) in term.iter_mut().zip(other) {
                 *value += add;
@@ -135,7 +141,7 @@ impl ClusterAccumulator {
     ///
     /// # Panics
     /// If no point was added: a voxel without points has no node.
-    pub fn finalize(&self, voxel: Voxel, quantizer: &Quantizer) -> FinalizedCluster {
+    pub fn finalize(&mut self, voxel: Voxel, quantizer: &Quantizer) -> FinalizedCluster {
         assert!(self.point_count > 0, "a cluster has at least one point");
         let edge = voxel.edge(quantizer);
         let mean = self.first_moment / self.area;
@@ -166,6 +172,7 @@ impl ClusterAccumulator {
             },
             covariance,
             variation: self.variation(),
+            visible: self.coverage.finish(&covariance, edge),
             sh,
         };
         FinalizedCluster { attributes, clamped }
@@ -339,7 +346,7 @@ mod tests {
         let points = wall([1.0, 0.5, 0.25], [0.1; 3]);
         let whole = summed(&points).finalize(Voxel::ROOT, &quantizer()).attributes;
         let mut merged = summed(&points[..150]);
-        merged.merge(&summed(&points[150..]));
+        merged.merge(7, &summed(&points[150..]));
         let merged = merged.finalize(Voxel::ROOT, &quantizer()).attributes;
         assert!(merged.centroid.distance(whole.centroid) < 1e-6);
         assert_eq!(merged.sh, whole.sh);

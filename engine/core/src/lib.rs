@@ -6,6 +6,7 @@
 
 pub mod bounds;
 pub mod cluster;
+pub mod coverage;
 pub mod environment;
 pub mod ids;
 pub mod limits;

@@ -13,13 +13,13 @@ use std::sync::LazyLock;
 /// One octree node with its cluster.
 ///
 /// ```text
-/// byte 0         12      16     20       24       25     26     27    28           40                       112         113 116
-///      | centroid | first | span | normal | level  |radius|spread| fill | covariance | sh                     | variation | zero|
-///      | 3 x f32  | u32   | u32  | 2 x i16| + kind | code | code | code | 6 x f16    | 9 x (area, r, g, b) f16| code      | 3 B |
+/// byte 0         12      16     20       24       25     26     27    28           40                       112         113    116
+///      | centroid | first | span | normal | level  |radius|spread| fill | covariance | sh                     | variation |visible|
+///      | 3 x f32  | u32   | u32  | 2 x i16| + kind | code | code | code | 6 x f16    | 9 x (area, r, g, b) f16| code      |3 codes|
 /// ```
 ///
 /// Siblings are contiguous and never cross a page, so a first child and a mask replace the paper's eight indices; the room
-/// goes to the footprint (covariance, mean normal, spread, fill).
+/// goes to the footprint (covariance, mean normal, spread, fill, visible share).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct NodeRecord {
@@ -39,7 +39,7 @@ pub struct NodeRecord {
     /// [`crate::pack::area_normaliser`] of the level.
     pub sh: [[f16; 4]; SH_TERMS],
     variation_code: u8,
-    zero: [u8; 3],
+    visible_codes: [u8; 3],
 }
 
 const _: () = assert!(size_of::<NodeRecord>() == 116);
@@ -87,6 +87,8 @@ pub struct NodeAttributes {
     pub covariance: [f32; 6],
     /// See [`NodeRecord::variation`].
     pub variation: f32,
+    /// See [`NodeRecord::visible`].
+    pub visible: Vec3,
     /// See [`NodeRecord::sh`], already normalised.
     pub sh: [[f16; 4]; SH_TERMS],
 }
@@ -107,6 +109,10 @@ static RADIUS_RATIOS: LazyLock<[f32; 256]> = LazyLock::new(|| {
 const FILL_STEPS: f32 = 64.0;
 /// Of shares from 0 to 1.
 const SHARE_STEPS: f32 = 255.0;
+
+fn share_code(share: f32) -> u8 {
+    (share.clamp(0.0, 1.0) * SHARE_STEPS).round() as u8
+}
 
 impl NodeRecord {
     /// Packs a node at `level`.
@@ -132,12 +138,12 @@ impl NodeRecord {
             axis_code: octahedral::encode(attributes.axis),
             level_and_kind: level as u8 | bits,
             radius_code,
-            spread_code: (attributes.spread.clamp(0.0, 1.0) * SHARE_STEPS).round() as u8,
+            spread_code: share_code(attributes.spread),
             fill_code: (attributes.fill * FILL_STEPS).round().clamp(0.0, 255.0) as u8,
             covariance,
             sh: attributes.sh,
             variation_code: (attributes.variation * SHARE_STEPS).ceil() as u8,
-            zero: [0; 3],
+            visible_codes: attributes.visible.to_array().map(share_code),
         }
     }
 
@@ -196,6 +202,12 @@ impl NodeRecord {
     #[inline]
     pub fn fill(&self) -> f32 {
         f32::from(self.fill_code) / FILL_STEPS
+    }
+
+    /// Share of the discs' projected area that no other disc of the cluster hides, seen along x, y and z.
+    #[inline]
+    pub fn visible(&self) -> Vec3 {
+        Vec3::from(self.visible_codes.map(f32::from)) / SHARE_STEPS
     }
 
     /// Standard deviation of the radiance of a side, over all channels, over the mean of the brighter one, rounded up; 1 and

@@ -6,6 +6,7 @@ use crate::vector::Vector;
 use glam::{Vec2, Vec3};
 use half::f16;
 use pbgi_core::cluster::separate_sides;
+use pbgi_core::coverage::scattered;
 use pbgi_core::pack::area_normaliser;
 use pbgi_core::sh::{BASIS_FACTORS, SH_TERMS, basis};
 use pbgi_core::{HitSides, NodeRecord};
@@ -14,9 +15,6 @@ use pbgi_core::{HitSides, NodeRecord};
 const AREA_TERM: f32 = 0.886_226_9;
 /// The same of the three linear terms, over the sum of its discs' normals times their areas.
 const NORMAL_TERM: f32 = 1.023_326_7;
-/// Length of the mean normal from which the discs of a cluster are one sheet, and up to which they face everywhere.
-const SHEET_NORMAL: f32 = 0.6;
-const SCATTERED_NORMAL: f32 = 0.2;
 /// A cluster whose normals spread less than this (root mean square sine) and that is thinner than [`FLAT_THICKNESS`] is a
 /// piece of a plane.
 const FLAT_SPREAD: f32 = 0.25;
@@ -208,32 +206,33 @@ impl<'a> Cluster<'a> {
             HitSides::Front => even + odd,
             HitSides::Back => even - odd,
         };
+        // Along an axis as the node says, between axes by the squares of the cosines.
+        let visible = Vector::splat(self.node.visible());
+        let visible = direction.x * direction.x * visible.x
+            + direction.y * direction.y * visible.y
+            + direction.z * direction.z * visible.z;
+        let normals = Vec3::new(terms[4], terms[8], terms[12]).length() / NORMAL_TERM;
+        let area = terms[0] / AREA_TERM;
         let [red, green, blue] = [bands(&terms, &y, 1), bands(&terms, &y, 2), bands(&terms, &y, 3)];
         Shown {
-            area: shown.max(zero) * scale,
+            area: shown.max(zero) * scale * visible,
             power: Vector {
                 x: (red[0] + red[1]).max(zero) * scale,
                 y: (green[0] + green[1]).max(zero) * scale,
                 z: (blue[0] + blue[1]).max(zero) * scale,
             },
-            scattered: scattered(&terms),
+            scattered: scattered(normals / area.max(f32::MIN_POSITIVE)),
         }
     }
 }
 
 /// A cluster without a plane, seen from some directions.
 pub(crate) struct Shown<F> {
-    /// Projected area of all sides of discs that count, hidden ones too.
+    /// Projected area of the sides of discs that count and that no other disc hides.
     pub(crate) area: F,
     pub(crate) power: Vector<F>,
-    /// How much of it is discs that face everywhere, which hide each other at random, as leaves do: 1, or a sheet, folded perhaps: 0.
+    /// See [`pbgi_core::coverage::scattered`].
     pub(crate) scattered: f32,
-}
-
-fn scattered(terms: &[f32; 4 * SH_TERMS]) -> f32 {
-    let normals = Vec3::new(terms[4], terms[8], terms[12]).length() / NORMAL_TERM;
-    let area = terms[0] / AREA_TERM;
-    ((SHEET_NORMAL - normals / area.max(f32::MIN_POSITIVE)) / (SHEET_NORMAL - SCATTERED_NORMAL)).clamp(0.0, 1.0)
 }
 
 /// Sums of the even and of the odd bands of a channel.

@@ -36,19 +36,6 @@ const WALL_SCALE: f32 = 1.2;
 /// ... if it covers this share of its rectangle.
 const WALL_SHARE: f32 = 0.7;
 
-/// Share of its rectangle that a round cluster covers which shows `share` of it. The parts of a sheet lie side by side; of
-/// scattered discs some hide others: as many as chance has it, 1 - exp(-share), within 0.03.
-#[inline(always)]
-fn covered_share<F: Floats>(share: F, scattered: f32) -> F {
-    /// A share beyond which nothing is open.
-    const FULL: f32 = 8.0;
-    let (one, share) = (F::splat(1.0), share.min(F::splat(FULL)));
-    let series = share * (one + share * (F::splat(0.5) + share * F::splat(1.0 / 6.0)));
-    let by_chance = series / (one + series);
-    let sheet = share.min(one);
-    sheet + F::splat(scattered) * (by_chance - sheet)
-}
-
 /// How much larger a round cluster is drawn than what it covers.
 #[inline(always)]
 fn wall_scale<F: Floats>(covered: F, scattered: f32) -> F {
@@ -181,7 +168,8 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, direction);
         let tiny = F::splat(1e-30);
         let rectangle = (F::splat(4.0) * a * b).max(tiny);
-        let covered = covered_share(shown.area / rectangle, shown.scattered);
+        let visible = shown.area.min(rectangle).max(tiny);
+        let covered = visible / rectangle;
         let density = (covered * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
         let scale = wall_scale(covered, shown.scattered) * covered.max(F::splat(OPAQUE_SHARE));
         let scale = scale.sqrt();
@@ -197,8 +185,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let thin = density.less(F::splat(1.0)).lanes() & lanes != 0;
         let covered = self.cover(&footprint, lanes, thin.then_some(density), weight, visit.path);
         if let Some(covered) = covered {
-            // What hides behind more than a rectangle's worth is taken for the unlit insides of a body.
-            let visible = shown.area.min(rectangle).max(tiny);
+            // What hides is taken to be as unlit as the insides of a body.
             let lit = covered.bits_set().select(covered.light / visible, F::splat(0.0));
             self.radiance = self.radiance + shown.power * lit;
         }
@@ -394,20 +381,5 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let within = ((F::splat(settings.max_dist) - distance + extent) / width).clamp(0.0, 1.0);
         let fade: [f32; LANES] = distance.to_array().map(|distance| (-settings.falloff * distance).exp());
         Some(within * F::from_array(fade))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::simd::ScalarFloats;
-
-    #[test]
-    fn scattered_discs_cover_what_chance_leaves_and_sheets_all_that_they_show() {
-        let covered = |share: f32, scattered| covered_share(ScalarFloats::splat(share), scattered).to_array()[0];
-        for share in [0.0f32, 0.1, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 1e30] {
-            assert!((covered(share, 1.0) - (1.0 - (-share).exp())).abs() < 0.03, "{share}");
-            assert_eq!(covered(share, 0.0), share.min(1.0));
-        }
     }
 }

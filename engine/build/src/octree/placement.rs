@@ -111,8 +111,9 @@ impl<'a> Placement<'a> {
         let children = self.open.split_off(self.open.len() - count);
         let mut siblings = [NodeRecord::zeroed(); 8];
         let mut sum = ClusterAccumulator::default();
-        for (sibling, child) in siblings.iter_mut().zip(&children) {
-            sum.merge(&child.sum);
+        let octants = (0..8).filter(|octant| mask >> octant & 1 == 1);
+        for ((sibling, child), octant) in siblings.iter_mut().zip(&children).zip(octants) {
+            sum.merge(octant, &child.sum);
             *sibling = child.record;
         }
         self.hand_over(voxel.level, &mut siblings[..count])?;

@@ -99,7 +99,7 @@ impl SubtreeBuilder<'_> {
             let end = start + count_in(&self.codes[start..to], child);
             if end > start {
                 let made = self.subtree(child, start, end);
-                sum.merge(&made.sum);
+                sum.merge(octant, &made.sum);
                 siblings[count] = made.record;
                 count += 1;
                 mask |= 1 << octant;
@@ -178,7 +178,7 @@ pub(crate) fn finalize_leaf(
 pub(crate) fn finalize(
     voxel: Voxel,
     kind: NodeKind,
-    sum: ClusterAccumulator,
+    mut sum: ClusterAccumulator,
     quantizer: &Quantizer,
     tallies: &mut Tallies,
 ) -> Subtree {

@@ -298,7 +298,7 @@ impl Tree {
             numbers.all(f32::is_finite) && node.axis().is_finite(),
             "{voxel:?} has numbers that are none: {node:?}"
         );
-        let sum = match node.kind() {
+        let mut sum = match node.kind() {
             NodeKind::Inner { first, mask } => self.check_children(first, mask, voxel),
             NodeKind::Leaf { first, count } => {
                 assert!(count <= self.settings.leaf_max);
@@ -332,7 +332,7 @@ impl Tree {
         let mut sum = ClusterAccumulator::default();
         let octants = (0..8).filter(|octant| mask >> octant & 1 == 1);
         for (offset, octant) in (0..).zip(octants) {
-            sum.merge(&self.check(NodeIndex(first.0 + offset), voxel.child(octant)));
+            sum.merge(octant, &self.check(NodeIndex(first.0 + offset), voxel.child(octant)));
         }
         assert!(
             sum.point_count() > u64::from(self.settings.leaf_max),

@@ -149,7 +149,7 @@ impl Builder<'_> {
                     .count();
                 if inside > 0 {
                     let (record, child_sum) = self.node(child, start..start + inside);
-                    sum.merge(&child_sum);
+                    sum.merge(octant, &child_sum);
                     children.push(record);
                     mask |= 1 << octant;
                     start += inside;
