@@ -6,6 +6,18 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
+scenes=(demo court cornell sponza sponza_sky autzen)
+[ $# -gt 0 ] || set -- "${scenes[@]}"
+for scene in "$@"; do
+    if [ "$scene" = --help ]; then
+        sed -n '2,/^set /{/^#/s/^# \?//p}' "$0"
+        exit
+    elif ! [[ " ${scenes[*]} " == *" $scene "* ]]; then
+        echo "error: no scene $scene; choose from: ${scenes[*]}" >&2
+        exit 2
+    fi
+done
+
 images=$PWD/docs/images
 bytes_max=400000
 bin=${PBGI_BIN:-target/release}
@@ -46,14 +58,14 @@ cornell() {
 sponza() {
     local mesh
     mesh=$(data sponza sponza/sponza_lit.gltf) || return 0
-    pbgi render "$mesh" -o "$work/sponza.exr" --png "$images/sponza.png" --overwrite --points 5500000 --size 544x306
+    pbgi render "$mesh" -o "$work/sponza.exr" --png "$images/sponza.png" --overwrite --view-spacing 1 --size 544x306
 }
 
 sponza_sky() {
     local mesh sky
     mesh=$(data sponza_sky sponza/sponza_lit.gltf) || return 0
     sky=$(data sponza_sky kiara_1_dawn_1k.hdr) || return 0
-    pbgi render "$mesh" -o "$work/sponza_sky.exr" --png "$images/sponza_sky.png" --overwrite --points 5500000 --size 544x306 \
+    pbgi render "$mesh" -o "$work/sponza_sky.exr" --png "$images/sponza_sky.png" --overwrite --view-spacing 1 --size 544x306 \
         --environment "$sky"
 }
 
@@ -64,13 +76,7 @@ autzen() {
     pbgi view "$work/autzen.pbgi" -o "$images/autzen.png" --overwrite --size 720x480 --memory 512M
 }
 
-scenes=(demo court cornell sponza sponza_sky autzen)
-[ $# -gt 0 ] || set -- "${scenes[@]}"
 for scene in "$@"; do
-    if ! [[ " ${scenes[*]} " == *" $scene "* ]]; then
-        echo "error: no scene $scene; choose from: ${scenes[*]}" >&2
-        exit 2
-    fi
     echo "== $scene" >&2
     "$scene"
     if [ -e "$images/$scene.png" ] && [ "$(stat -c %s "$images/$scene.png")" -gt "$bytes_max" ]; then

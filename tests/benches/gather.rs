@@ -27,8 +27,10 @@ const GROUP_STEP: u32 = 61;
 /// Rays of each of the two references, along one edge of their grid.
 const REFERENCE_SIDE: u32 = 32;
 /// Settings of the gather: solid angle of a cut element, raster resolution, error of interpolation.
-const SETTINGS: [(f32, u32, f32); 9] = [
+const SETTINGS: [(f32, u32, f32); 11] = [
+    (1.0, 32, 0.0),
     (0.5, 32, 0.0),
+    (0.5, 32, 0.02),
     (0.2, 32, 0.0),
     (0.2, 32, 0.02),
     (0.1, 32, 0.0),

@@ -101,7 +101,10 @@ pub(crate) async fn render(args: RenderArgs, interrupt: &Interrupt) -> Result<()
         output: files::output_of_kind(&args.output.output, existing, "exr")?,
         look: args.look.check(existing)?,
         camera: args.camera,
-        density: args.density.density().unwrap_or(SampleOptions::default().density),
+        density: args
+            .density
+            .density_for(&args.camera)
+            .unwrap_or(SampleOptions::default().density),
         environment: args.quality.environment.as_deref().map(files::input).transpose()?,
     };
     picture(&plan, &args.server, &args.stats, interrupt).await
@@ -113,6 +116,10 @@ pub(crate) async fn demo(args: DemoArgs, interrupt: &Interrupt) -> Result<(), Fa
     let output = args.output.as_deref().unwrap_or(Path::new(DEMO_OUTPUT));
     args.stats.check()?;
     let folder = temporary_folder()?;
+    let camera = CameraArgs {
+        camera: None,
+        size: Some(args.size.unwrap_or(DEMO_SIZE)),
+    };
     let mut plan = Plan {
         settings: args.quality.settings()?,
         input: folder.path().join("demo.glb"),
@@ -120,11 +127,11 @@ pub(crate) async fn demo(args: DemoArgs, interrupt: &Interrupt) -> Result<(), Fa
         look: args
             .exposure
             .look(Some(files::output(&output.with_extension("png"), existing)?)),
-        camera: CameraArgs {
-            camera: None,
-            size: Some(args.size.unwrap_or(DEMO_SIZE)),
-        },
-        density: args.density.density().unwrap_or(Density::Points(DEMO_POINTS)),
+        density: args
+            .density
+            .density_for(&camera)
+            .unwrap_or(Density::Points(DEMO_POINTS)),
+        camera,
         environment: args.quality.environment.as_deref().map(files::input).transpose()?,
     };
     demo::write_glb(&plan.input)?;

@@ -1,5 +1,6 @@
 //! Options about how files become points, and points an octree.
 
+use super::camera::CameraArgs;
 use super::{Size, picture_size, positive, triple};
 use crate::cmd::answer::note;
 use crate::cmd::failure::Failure;
@@ -23,12 +24,12 @@ pub(crate) struct DensityArgs {
     /// Distance between neighbouring points as a camera sees them, pixels: finer near, coarser far and out of its sight
     #[arg(long, allow_negative_numbers = true, value_name = "PIXELS", value_parser = positive, conflicts_with_all = ["points", "spacing"])]
     view_spacing: Option<f32>,
-    /// Which of the scene's cameras that is, from 0
-    #[arg(long, value_name = "N", default_value_t = 0, requires = "view_spacing")]
-    view_camera: usize,
-    /// Pixels of its picture
-    #[arg(long, value_name = "WxH", default_value = "1920x1080", value_parser = picture_size, requires = "view_spacing")]
-    view_size: Size,
+    /// Which of the scene's cameras that is, from 0 [default: that of the picture, else 0]
+    #[arg(long, value_name = "N", requires = "view_spacing")]
+    view_camera: Option<usize>,
+    /// Pixels of its picture [default: --size of the picture, else 1920x1080]
+    #[arg(long, value_name = "WxH", value_parser = picture_size, requires = "view_spacing")]
+    view_size: Option<Size>,
     /// Least distance between points, world units [default: a 20,000th of the scene's diagonal]
     #[arg(long, allow_negative_numbers = true, value_name = "D", value_parser = positive, requires = "view_spacing")]
     spacing_min: Option<f32>,
@@ -37,12 +38,24 @@ pub(crate) struct DensityArgs {
     spacing_max: Option<f32>,
 }
 
+/// Of a picture that is not known yet.
+const VIEW_SIZE: Size = Size {
+    width: 1920,
+    height: 1080,
+};
+
 impl DensityArgs {
     pub(crate) fn density(&self) -> Option<Density> {
+        self.density_for(&CameraArgs::default())
+    }
+
+    /// For a picture that this camera takes.
+    pub(crate) fn density_for(&self, picture: &CameraArgs) -> Option<Density> {
+        let size = self.view_size.or(picture.size).unwrap_or(VIEW_SIZE);
         let view = |pixels| {
             Density::View(ViewDensity {
-                camera: self.view_camera,
-                size: [self.view_size.width, self.view_size.height],
+                camera: self.view_camera.or(picture.camera).unwrap_or(0),
+                size: [size.width, size.height],
                 pixels,
                 floor: self.spacing_min,
                 ceiling: self.spacing_max,
