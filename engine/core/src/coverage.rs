@@ -96,16 +96,20 @@ impl Coverage {
         columns.sum::<f64>() / 4.0
     }
 
-    /// See [`scattered`]. From all pairs of discs, so that a few are not taken for a sheet because their normals do not cancel
-    /// out.
     fn scattered(&self) -> f64 {
-        let pairs = self.area * self.area - self.area_squares;
-        if pairs <= NOTHING * self.area * self.area {
-            return 0.0;
-        }
-        let mean_square = (self.normal.length_squared() - self.area_squares) / pairs;
-        scattered(mean_square.max(0.0).sqrt() as f32).into()
+        scattered_pairs(self.normal, self.area, self.area_squares)
     }
+}
+
+/// See [`scattered`]; from sums over discs of area times normal, of areas and of the squares of areas. It looks at all pairs of
+/// discs, so that a few are not taken for a sheet because their normals do not cancel out.
+pub fn scattered_pairs(normal: DVec3, area: f64, area_squares: f64) -> f64 {
+    let pairs = area * area - area_squares;
+    if pairs <= NOTHING * area * area {
+        return 0.0;
+    }
+    let mean_square = (normal.length_squared() - area_squares) / pairs;
+    scattered(mean_square.max(0.0).sqrt() as f32).into()
 }
 
 /// How much of a cluster is discs that face everywhere, as leaves do: 1, or a sheet, folded perhaps: 0. `normal` is the length of

@@ -4,6 +4,7 @@
 
 use crate::cluster::SECTION_FILL;
 use glam::{DVec3, Vec3};
+use pbgi_core::coverage::scattered_pairs;
 use pbgi_core::section::{HalfSpace, section_area, voxel_half_spaces, voxel_section_area};
 use pbgi_core::{NodeIndex, PointRecord};
 
@@ -24,6 +25,8 @@ const POINT_REACH: f32 = 2.0;
 /// Share of its section that a facet's points must cover to be drawn as the section. A leaf holds few points, so the share is
 /// uncertain by a third.
 const FACET_FILL: f32 = 0.35;
+/// Discs of a surface are drawn this much wider than their area says, because round ones of equal area leave gaps.
+pub(crate) const DISC_SCALE: f32 = 1.4;
 /// Membership is kept in one word.
 const POINTS_MAX: usize = 64;
 
@@ -50,6 +53,8 @@ pub(crate) struct Disc {
     pub(crate) center: Vec3,
     pub(crate) normal: Vec3,
     pub(crate) radius: f32,
+    /// Radius that it is drawn with.
+    pub(crate) drawn_radius: f32,
     /// Radiance of the front and of the back.
     pub(crate) radiance: [Vec3; 2],
 }
@@ -98,12 +103,13 @@ impl Facet {
 }
 
 impl Disc {
-    fn new(point: &PointRecord) -> Self {
+    fn new(point: &PointRecord, scale: f32) -> Self {
         let sides = point.sides();
         Self {
             center: point.position.into(),
             normal: point.normal(),
             radius: point.radius,
+            drawn_radius: point.radius * scale,
             radiance: [sides.front.into(), sides.back.into()],
         }
     }
@@ -155,10 +161,11 @@ impl Leaves {
 /// Takes a leaf apart.
 fn take_apart(points: &[PointRecord], voxel: Cube, parts: &mut Vec<Part>) {
     parts.clear();
+    let scale = disc_scale(points);
     let discs = |members: u64| {
         let inside = move |(index, _): &(usize, &PointRecord)| members >> (index % POINTS_MAX) & 1 == 1;
         let members = points.iter().enumerate().filter(inside);
-        members.map(|(_, point)| Part::Disc(Disc::new(point)))
+        members.map(|(_, point)| Part::Disc(Disc::new(point, scale)))
     };
     let Some((planes, len)) = planes(points, voxel.center) else {
         parts.extend(discs(u64::MAX));
@@ -190,6 +197,18 @@ fn take_apart(points: &[PointRecord], voxel: Cube, parts: &mut Vec<Part>) {
             cut_count,
         }));
     }
+}
+
+/// How much wider than they are the discs of a leaf are drawn: those of a surface would leave gaps, leaves of a tree lie apart.
+fn disc_scale(points: &[PointRecord]) -> f32 {
+    let (mut normal, mut area, mut squares) = (DVec3::ZERO, 0.0, 0.0);
+    for point in points {
+        let its_area = f64::from(point.area());
+        normal += point.normal().as_dvec3() * its_area;
+        area += its_area;
+        squares += its_area * its_area;
+    }
+    DISC_SCALE + (1.0 - DISC_SCALE) * scattered_pairs(normal, area, squares) as f32
 }
 
 /// How far a section's box reaches out of its voxel, as shares of half its edge: a plane along a face must not fall out of it

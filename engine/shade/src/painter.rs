@@ -12,8 +12,6 @@ use pbgi_core::HitSides;
 
 /// Above this the voxel holds two sheets, of which the receiver sees one.
 const TWO_SHEETS_FILL: f32 = 1.6;
-/// Discs are drawn this much wider than their area says, because round ones of equal area leave gaps on a surface.
-const DISC_SCALE: f32 = 1.4;
 /// Distance in radii within which a disc may be the receiver's own surface.
 const NEAR_RADII: f32 = 6.0;
 /// Width of what a disc or facet stands for, in radii, when asked whether a receiver lies on it.
@@ -266,8 +264,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         }
         let [u, v] = orthonormal_pair(normal);
         let axes = [frames.local_from_world(u), frames.local_from_world(v)];
-        let radius = disc.radius * DISC_SCALE;
-        let footprint = Footprint::disc(frames.local_from_world(center), &plane, axes, radius);
+        let footprint = Footprint::disc(frames.local_from_world(center), &plane, axes, disc.drawn_radius);
         let weight = self.weight(
             center,
             #[inline(always)]
@@ -291,7 +288,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let beside = squared - distance * distance;
         let overhangs = receiver_normal.dot(center).less(F::splat(OVERHANG * disc.radius));
         let under = overhangs
-            & beside.less(F::splat((DISC_SCALE * disc.radius).powi(2)))
+            & beside.less(F::splat(disc.drawn_radius.powi(2)))
             & distance.less(F::splat(UNDER_DEPTH * disc.radius));
         let facing = F::splat(SAME_SHEET).less(normal.dot(receiver_normal));
         let behind =
