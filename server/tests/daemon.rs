@@ -264,7 +264,7 @@ async fn build_that_dies_costs_its_job_and_no_page_of_a_picture_beside_it() {
     site.hold_after(10);
     site.submit("shade", site.shade("a.exr")).await.unwrap();
     site.reaches("shade", 10).await;
-    write_cloud(&site.daemon.folder.path().join("big.ply"), 1_000_000);
+    write_cloud(&site.daemon.folder.path().join("big.ply"), 4_000_000);
     // A fault, what the kernel does when memory runs out, and what an assertion does.
     for signal in ["-SEGV", "-KILL", "-ABRT"] {
         let mut attempt = 0;

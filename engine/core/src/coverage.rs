@@ -1,4 +1,4 @@
-//! [`Coverage`]: how much a cluster covers, seen along the axes. It is less than the sum of its discs, as some hide others.
+//! How much a cluster covers, seen along the axes. It is less than the sum of its discs, as some hide others.
 //!
 //! The parts of one surface lie beside each other; the front of a house hides its back; leaves hide each other by chance,
 //! and stand in clumps, so that a crown covers less than chance alone has it (Nilson 1971, "A theoretical analysis of the

@@ -317,7 +317,7 @@ mod tests {
             let path = pbgi_tests::workspace_root().join("docs").join(name);
             std::fs::read_to_string(path).unwrap_or_default()
         };
-        for (name, charts) in [("gathering.md", 10), ("cache.md", 3)] {
+        for (name, charts) in [("gathering.md", 14), ("cache.md", 3)] {
             let sheet = read(&document(name));
             assert_eq!(sheet.as_ref().map(|sheet| sheet.charts.len()), Some(charts), "{name}");
             for chart in sheet.into_iter().flat_map(|sheet| sheet.charts) {
