@@ -26,7 +26,7 @@ const POINT_REACH: f32 = 2.0;
 /// uncertain by a third.
 const FACET_FILL: f32 = 0.35;
 /// Discs of a surface are drawn this much wider than their area says, because round ones of equal area leave gaps.
-pub(crate) const DISC_SCALE: f32 = 1.4;
+const DISC_SCALE: f32 = 1.4;
 /// Membership is kept in one word.
 const POINTS_MAX: usize = 64;
 

@@ -78,16 +78,6 @@ impl RunReader {
         Ok(reader)
     }
 
-    /// Runs.
-    pub fn len(&self) -> usize {
-        self.lanes.len()
-    }
-
-    /// Whether there are no runs.
-    pub fn is_empty(&self) -> bool {
-        self.lanes.is_empty()
-    }
-
     /// The part of a run that is to be looked at; empty at its end.
     #[inline]
     pub fn records(&self, run: usize) -> &[PointRecord] {
