@@ -17,17 +17,15 @@ use glam::{DMat3, DVec3, Vec3};
 pub struct ClusterAccumulator {
     /// Harmonics of (projected front area, power r, g, b).
     sh: [[f64; 4]; SH_TERMS],
-    area: f64,
     /// Sum of area times position.
     first_moment: DVec3,
     /// Sum of area times position outer position, with the disc's own extent: xx, yy, zz, xy, xz, yz.
     second_moment: [f64; 6],
-    /// Sum of area times normal.
-    normal: DVec3,
     /// Sum of area times normal outer normal: xx, yy, zz, xy, xz, yz.
     normal_moment: [f64; 6],
     /// Light of the front and of the back.
     light: [LightSums; 2],
+    /// Areas and normals are among its sums.
     coverage: Coverage,
     radius_max: f32,
     point_count: u64,
@@ -55,10 +53,8 @@ impl Default for ClusterAccumulator {
     fn default() -> Self {
         Self {
             sh: [[0.0; 4]; SH_TERMS],
-            area: 0.0,
             first_moment: DVec3::ZERO,
             second_moment: [0.0; 6],
-            normal: DVec3::ZERO,
             normal_moment: [0.0; 6],
             light: [LightSums::default(); 2],
             coverage: Coverage::default(),
@@ -94,10 +90,8 @@ impl ClusterAccumulator {
         let position = DVec3::from_array(point.position.map(f64::from)) - DVec3::from_array(quantizer.origin);
         let normal = normal.as_dvec3();
         let spread = radius * radius / 4.0;
-        self.area += area;
         self.coverage.add(point, area);
         self.first_moment += position * area;
-        self.normal += normal * area;
         let outer_position = outer(position);
         let outer_normal = outer(normal);
         for i in 0..6 {
@@ -122,9 +116,7 @@ impl ClusterAccumulator {
                 *value += add;
             }
         }
-        self.area += child.area;
         self.first_moment += child.first_moment;
-        self.normal += child.normal;
         for i in 0..6 {
             self.second_moment[i] += child.second_moment[i];
             self.normal_moment[i] += child.normal_moment[i];
@@ -144,18 +136,18 @@ impl ClusterAccumulator {
     pub fn finalize(&mut self, voxel: Voxel, quantizer: &Quantizer) -> FinalizedCluster {
         assert!(self.point_count > 0, "a cluster has at least one point");
         let edge = voxel.edge(quantizer);
-        let mean = self.first_moment / self.area;
+        let mean = self.first_moment / self.coverage.area;
         let mean_outer = outer(mean);
         let mut covariance = [0.0f32; 6];
         for i in 0..6 {
-            let variance = self.second_moment[i] / self.area - mean_outer[i];
+            let variance = self.second_moment[i] / self.coverage.area - mean_outer[i];
             let variance = if i < 3 { variance.max(0.0) } else { variance };
             // Discs may be far wider than their voxel.
             let limit = f64::from(HALF_MAX);
             covariance[i] = (variance / (edge * edge)).clamp(-limit, limit) as f32;
         }
         let axis = self.axis();
-        let aligned = quadratic_form(&self.normal_moment, axis) / self.area;
+        let aligned = quadratic_form(&self.normal_moment, axis) / self.coverage.area;
         let origin = DVec3::from_array(quantizer.origin);
         let center = DVec3::from_array(voxel.min_corner(quantizer)) - origin + edge / 2.0;
         let section = voxel_section_area(mean, axis, center, edge / 2.0);
@@ -166,7 +158,7 @@ impl ClusterAccumulator {
             radius_ratio: self.radius_max / edge as f32,
             spread: (1.0 - aligned).max(0.0).sqrt() as f32,
             fill: if section > 0.0 {
-                (self.area / section) as f32
+                (self.coverage.area / section) as f32
             } else {
                 0.0
             },
@@ -181,8 +173,8 @@ impl ClusterAccumulator {
     /// See [`NodeAttributes::variation`].
     fn variation(&self) -> f32 {
         let [front, back] = self.light.map(|sums| {
-            let mean = sums.first / self.area;
-            let variance = sums.second / self.area - mean.length_squared();
+            let mean = sums.first / self.coverage.area;
+            let variance = sums.second / self.coverage.area - mean.length_squared();
             (mean.length(), variance.max(0.0).sqrt())
         });
         let (brightest, deviation) = (front.0.max(back.0), front.1.max(back.1));
@@ -216,7 +208,11 @@ impl ClusterAccumulator {
             .into_iter()
             .max_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
         let axis = longest.and_then(DVec3::try_normalize).unwrap_or(DVec3::Z);
-        if axis.dot(self.normal) < 0.0 { -axis } else { axis }
+        if axis.dot(self.coverage.normal) < 0.0 {
+            -axis
+        } else {
+            axis
+        }
     }
 }
 

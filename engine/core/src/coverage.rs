@@ -18,11 +18,12 @@ const NOTHING: f64 = 1e-6;
 /// What a voxel's discs cover, added point by point in leaves and child by child above.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Coverage {
-    area: f64,
+    /// Sum of areas.
+    pub(crate) area: f64,
     /// Sum of the squares of areas.
     area_squares: f64,
     /// Sum of area times normal.
-    normal: DVec3,
+    pub(crate) normal: DVec3,
     /// Sum of area times the normal's part along each axis: what is seen along it, hidden discs too.
     shown: DVec3,
     children: [Option<Child>; 8],
