@@ -115,7 +115,8 @@ impl HitSides {
 /// How receivers are shaded. Names are RenderMan's.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ShadeSettings {
-    /// Largest solid angle of a cut element, steradian (`maxsolidangle`).
+    /// Largest solid angle of a cut element above a receiver, steradian (`maxsolidangle`); toward the horizon, where light counts
+    /// for less, up to four times as large.
     pub max_solid_angle: f32,
     /// Rows and columns of the raster (`rasterresolution`).
     pub raster_resolution: u32,

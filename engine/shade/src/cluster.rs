@@ -82,9 +82,11 @@ pub(crate) struct Cluster<'a> {
 impl<'a> Cluster<'a> {
     #[inline(always)]
     pub(crate) fn new<F: Floats>(node: &'a NodeRecord, edge: f32) -> Self {
-        let axis = node.axis();
-        let covariance = to_floats::<F, 6>(&node.covariance).map(|value| value * (edge * edge));
+        let [xx, yy, zz, xy, xz, yz] = node.covariance;
+        let [covariance @ .., area, _] = F::from_halves([xx, yy, zz, xy, xz, yz, node.sh[0][0], f16::ZERO]).to_array();
+        let covariance = covariance.map(|value| value * (edge * edge));
         let normaliser = area_normaliser(edge);
+        let axis = node.axis();
         let across = quadratic_form(&covariance, axis).max(0.0).sqrt();
         let (fill, spread) = (node.fill(), node.spread());
         let flat = spread < FLAT_SPREAD && across < FLAT_THICKNESS * edge;
@@ -99,7 +101,7 @@ impl<'a> Cluster<'a> {
             centroid: node.centroid.into(),
             axis,
             covariance,
-            area: node.sh[0][0].to_f32() * normaliser / AREA_TERM,
+            area: area * normaliser / AREA_TERM,
             fill,
             edge,
             spread,
@@ -164,7 +166,16 @@ impl<'a> Cluster<'a> {
 
     #[inline(always)]
     fn terms<F: Floats>(&self) -> [f32; 4 * SH_TERMS] {
-        to_floats::<F, { 4 * SH_TERMS }>(bytemuck::cast_ref(&self.node.sh))
+        let halves: &[f16; 4 * SH_TERMS] = bytemuck::cast_ref(&self.node.sh);
+        let mut floats = [0.0; 4 * SH_TERMS];
+        let (eights, _) = halves.as_chunks::<LANES>();
+        for (floats, eight) in floats.chunks_exact_mut(LANES).zip(eights) {
+            floats.copy_from_slice(&F::from_halves(*eight).to_array());
+        }
+        // The last four are in no eight of their own.
+        let last = halves.len() - LANES;
+        floats[last..].copy_from_slice(&F::from_halves(std::array::from_fn(|lane| halves[last + lane])).to_array());
+        floats
     }
 
     /// Power of a flat cluster's two sides: radiance times area, the side of the axis first.
@@ -196,58 +207,77 @@ impl<'a> Cluster<'a> {
 
     /// What it shows of itself toward unit directions.
     #[inline(always)]
-    pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>, sides: HitSides) -> Shown<F> {
-        let terms = self.terms::<F>();
-        let y = basis_of(direction);
-        let (zero, scale) = (F::splat(0.0), F::splat(self.normaliser));
-        let [even, odd] = bands(&terms, &y, 0);
+    pub(crate) fn toward<F: Floats>(&self, direction: Vector<F>) -> Shown<'_, F> {
+        Shown {
+            cluster: self,
+            terms: self.terms::<F>(),
+            direction,
+            basis: basis_of(direction),
+        }
+    }
+}
+
+/// A cluster without a plane, seen from some directions.
+pub(crate) struct Shown<'a, F> {
+    cluster: &'a Cluster<'a>,
+    terms: [f32; 4 * SH_TERMS],
+    direction: Vector<F>,
+    basis: [F; SH_TERMS],
+}
+
+impl<F: Floats> Shown<'_, F> {
+    /// Projected area of the sides of discs that count and that no other disc hides.
+    #[inline(always)]
+    pub(crate) fn area(&self, sides: HitSides) -> F {
+        let [even, odd] = self.bands(0);
         let shown = match sides {
             HitSides::Both => even + even,
             HitSides::Front => even + odd,
             HitSides::Back => even - odd,
         };
         // Along an axis as the node says, between axes by the squares of the cosines.
-        let visible = Vector::splat(self.node.visible());
+        let visible = Vector::splat(self.cluster.node.visible());
+        let direction = self.direction;
         let visible = direction.x * direction.x * visible.x
             + direction.y * direction.y * visible.y
             + direction.z * direction.z * visible.z;
+        shown.max(F::splat(0.0)) * F::splat(self.cluster.normaliser) * visible
+    }
+
+    /// Radiance times projected area.
+    #[inline(always)]
+    pub(crate) fn power(&self) -> Vector<F> {
+        Vector {
+            x: self.channel(1),
+            y: self.channel(2),
+            z: self.channel(3),
+        }
+    }
+
+    #[inline(always)]
+    fn channel(&self, channel: usize) -> F {
+        let [even, odd] = self.bands(channel);
+        (even + odd).max(F::splat(0.0)) * F::splat(self.cluster.normaliser)
+    }
+
+    /// See [`pbgi_core::coverage::scattered`].
+    #[inline(always)]
+    pub(crate) fn scattered(&self) -> f32 {
+        let terms = &self.terms;
         let normals = Vec3::new(terms[4], terms[8], terms[12]).length() / NORMAL_TERM;
         let area = terms[0] / AREA_TERM;
-        let [red, green, blue] = [bands(&terms, &y, 1), bands(&terms, &y, 2), bands(&terms, &y, 3)];
-        Shown {
-            area: shown.max(zero) * scale * visible,
-            power: Vector {
-                x: (red[0] + red[1]).max(zero) * scale,
-                y: (green[0] + green[1]).max(zero) * scale,
-                z: (blue[0] + blue[1]).max(zero) * scale,
-            },
-            scattered: scattered(normals / area.max(f32::MIN_POSITIVE)),
-        }
+        scattered(normals / area.max(f32::MIN_POSITIVE))
     }
-}
 
-/// A cluster without a plane, seen from some directions.
-pub(crate) struct Shown<F> {
-    /// Projected area of the sides of discs that count and that no other disc hides.
-    pub(crate) area: F,
-    pub(crate) power: Vector<F>,
-    /// See [`pbgi_core::coverage::scattered`].
-    pub(crate) scattered: f32,
-}
-
-/// Sums of the even and of the odd bands of a channel.
-#[inline(always)]
-fn bands<F: Floats>(terms: &[f32; 4 * SH_TERMS], y: &[F; SH_TERMS], channel: usize) -> [F; 2] {
-    let (mut even, mut odd) = (F::splat(0.0), F::splat(0.0));
-    for (term, y) in y.iter().enumerate() {
-        let factor = F::splat(terms[term * 4 + channel]);
-        if (1..4).contains(&term) {
-            odd = factor.mul_add(*y, odd);
-        } else {
-            even = factor.mul_add(*y, even);
-        }
+    /// Sums of the even and of the odd bands of a channel.
+    #[inline(always)]
+    fn bands(&self, channel: usize) -> [F; 2] {
+        let with = |index: usize, sum: F| F::splat(self.terms[index * 4 + channel]).mul_add(self.basis[index], sum);
+        let zero = F::splat(0.0);
+        let even = with(8, with(7, with(6, with(5, with(4, with(0, zero))))));
+        let odd = with(3, with(2, with(1, zero)));
+        [even, odd]
     }
-    [even, odd]
 }
 
 /// The nine basis functions in unit directions; see [`basis`].
@@ -290,17 +320,6 @@ pub(crate) fn is_own_surface<F: Floats>(
         F::splat(SAME_SURFACE).less(facing.abs()) & chord.less(F::splat(ARC_SLACK) * center.length_squared().sqrt());
     let in_depth = F::splat(SAME_SHEET).less(facing) & behind.less(F::splat(SHEET_DEPTH * size));
     !behind.less(F::splat(0.0)) & (on_arc | in_depth)
-}
-
-#[inline(always)]
-fn to_floats<F: Floats, const N: usize>(halves: &[f16; N]) -> [f32; N] {
-    let mut floats = [0.0; N];
-    for (floats, halves) in floats.chunks_mut(LANES).zip(halves.chunks(LANES)) {
-        let mut eight = [f16::ZERO; LANES];
-        eight[..halves.len()].copy_from_slice(halves);
-        floats.copy_from_slice(&F::from_halves(eight).to_array()[..halves.len()]);
-    }
-    floats
 }
 
 #[inline(always)]

@@ -8,7 +8,7 @@ use crate::cluster::Cluster;
 use crate::frame::Frame;
 use crate::leaf::{Cube, Leaves, Part};
 use crate::painter::Painter;
-use crate::raster::{Raster, RasterTables};
+use crate::raster::{Raster, RasterTables, Window};
 use crate::shader::{Receiver, ShadeCounters, ShadeError};
 use crate::simd::{Floats, LANES, ScalarFloats, Words};
 use crate::source::{SceneSource, SourceError, Upcoming, Wanted};
@@ -20,6 +20,9 @@ use std::ops::ControlFlow;
 
 /// Octants by distance from the nearest, as differences in bits.
 const NEAR_TO_FAR: [u32; 8] = [0, 1, 2, 4, 3, 5, 6, 7];
+
+/// Cosine to the receiver's normal below which clusters grow no larger.
+const COSINE_MIN: f32 = 0.25;
 
 /// What a walk needs that is the same for all receivers.
 pub(crate) struct Walk<'a> {
@@ -72,17 +75,55 @@ impl Visit {
         self.half * 1.732_051 + self.radius
     }
 
-    /// Squared distance from its centre up to which it is always opened: receivers that may be inside.
+    /// Distance from its centre up to which it is always opened: receivers that may be inside.
     #[inline(always)]
-    fn apart_squared(&self) -> f32 {
-        3.6 * self.half * self.half
+    fn apart(&self) -> f32 {
+        1.9 * self.half
+    }
+}
+
+/// A voxel to visit as receivers see it: what can be told when its parent is opened, for eight children at a time faster than one
+/// by one.
+pub(crate) struct Sight<F: Floats, const WORDS: usize> {
+    pub(crate) visit: Visit,
+    /// How far away its centre is.
+    distance: F,
+    /// The most that light from it can count for, as a cosine; low ones still are discs to be told apart from each other.
+    cosine: F,
+    /// Where it shows.
+    pub(crate) window: Window<F, WORDS>,
+    /// Lanes far enough from it for the window to mean something.
+    pub(crate) far: u8,
+}
+
+impl<F: Floats, const WORDS: usize> Sight<F, WORDS> {
+    /// `None` for a voxel that is lower than every bit.
+    #[inline(always)]
+    fn new(walk: &Walk<'_>, pack: &Pack<F>, visit: Visit) -> Option<Self> {
+        let center = pack.root + Vector::splat(visit.offset);
+        let distance = center.length_squared().sqrt();
+        let reach = visit.reach();
+        let local = pack.frames.local_from_world(center);
+        let height = local.z + F::splat(reach);
+        let nearest = distance - F::splat(reach);
+        let below = height.less(nearest * F::splat(walk.tables.lowest));
+        let lanes = visit.lanes & !below.lanes();
+        if lanes == 0 {
+            return None;
+        }
+        Some(Self {
+            visit: Visit { lanes, ..visit },
+            distance,
+            cosine: (height / distance).clamp(COSINE_MIN, 1.0),
+            window: Window::of_spheres(walk.tables, &local, reach, lanes),
+            far: F::splat(1.05 * reach).less(distance).lanes(),
+        })
     }
 }
 
 /// Memory that walks use again and again.
 #[derive(Default)]
 pub(crate) struct Scratch {
-    stack: Vec<Visit>,
     points: Vec<PointRecord>,
     leaves: Leaves,
     order: Vec<(f32, u32)>,
@@ -124,21 +165,22 @@ impl<F: Floats> Pack<F> {
 }
 
 /// What a gather has before it.
-struct Pending<'a> {
+struct Pending<'a, F: Floats, const WORDS: usize> {
     walk: &'a Walk<'a>,
     leader: Leader,
-    stack: &'a [Visit],
+    stack: &'a [Sight<F, WORDS>],
 }
 
-impl Upcoming for Pending<'_> {
+impl<F: Floats, const WORDS: usize> Upcoming for Pending<'_, F, WORDS> {
     fn tell<'a>(
         &self,
         peek: impl Fn(NodeIndex) -> Option<&'a NodeRecord>,
         mut want: impl FnMut(Wanted) -> ControlFlow<()>,
     ) -> ControlFlow<()> {
-        for visit in self.stack.iter().rev() {
+        for Sight { visit, .. } in self.stack.iter().rev() {
             let center = self.leader.root + visit.offset;
-            if self.leader.normal.dot(center) < -visit.reach() {
+            let height = self.leader.normal.dot(center) + visit.reach();
+            if height < 0.0 {
                 continue;
             }
             let Some(node) = peek(visit.index) else {
@@ -147,9 +189,10 @@ impl Upcoming for Pending<'_> {
             };
             let cluster = Cluster::new::<ScalarFloats>(node, 2.0 * visit.half);
             let (from, _) = cluster.accepted_from_squared(self.walk.settings.max_solid_angle);
+            let cosine = (height / center.length()).clamp(COSINE_MIN, 1.0);
             let distance = (cluster.centroid - self.leader.position).length_squared();
             let whole = matches!(node.kind(), NodeKind::Leaf { .. }) && cluster.fills_section();
-            if !whole && (distance <= from || center.length_squared() <= visit.apart_squared()) {
+            if !whole && (distance <= from * cosine || center.length() <= visit.apart()) {
                 Wanted::below(node).map_or(ControlFlow::Continue(()), &mut want)?;
             }
         }
@@ -164,19 +207,15 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
     pack: &Pack<F>,
     source: &mut S,
     raster: &mut Raster<F, WORDS>,
+    stack: &mut Vec<Sight<F, WORDS>>,
     scratch: &mut Scratch,
     counters: &mut ShadeCounters,
 ) -> Result<Seen<F>, ShadeError> {
     let mut painter = Painter::new(walk, pack, raster);
-    let Scratch {
-        stack,
-        points,
-        leaves,
-        order,
-    } = scratch;
+    let Scratch { points, leaves, order } = scratch;
     stack.clear();
     if let (Some(root), Some(quantizer)) = (walk.info.root, walk.info.quantizer) {
-        stack.push(Visit {
+        let root = Visit {
             index: root,
             offset: Vec3::ZERO,
             half: (quantizer.edge / 2.0) as f32,
@@ -184,18 +223,20 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
             path: 0,
             radius: walk.info.radius_max,
             lanes: pack.lanes,
-        });
+        };
+        stack.extend(Sight::new(walk, pack, root));
     }
     let middle = walk.info.quantizer.map_or(DVec3::ZERO, |quantizer| {
         DVec3::from(quantizer.origin) + DVec3::splat(quantizer.edge / 2.0)
     });
     let mut visited = F::Words::splat(0);
-    while let Some(visit) = stack.pop() {
-        let center = pack.root + Vector::splat(visit.offset);
-        let lanes = painter.seen_by(&visit, center);
+    while let Some(sight) = stack.pop() {
+        let lanes = painter.seen_by(&sight);
         if lanes == 0 {
             continue;
         }
+        let visit = sight.visit;
+        let center = pack.root + Vector::splat(visit.offset);
         visited = visited.wrapping_sub(F::Words::from_lanes(lanes));
         if visited.greater_signed(F::Words::splat(CUT_NODES_MAX)).lanes() != 0 {
             return Err(ShadeError::Budget { nodes: CUT_NODES_MAX });
@@ -221,9 +262,9 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
         let accepted = if whole {
             lanes
         } else {
-            let apart = F::splat(visit.apart_squared()).less(center.length_squared());
+            let apart = F::splat(visit.apart()).less(sight.distance);
             let (from, from_stretched) = cluster.accepted_from_squared(walk.settings.max_solid_angle);
-            let distance = centroid.length_squared();
+            let distance = centroid.length_squared() / sight.cosine;
             let accepted = lanes & (apart & F::splat(from).less(distance)).lanes();
             let stretched = lanes & !accepted & (apart & F::splat(from_stretched).less(distance)).lanes();
             if stretched == 0 {
@@ -269,7 +310,9 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
             opened &= !together;
             match kind {
                 NodeKind::Inner { first, mask } => {
-                    push_children(stack, &visit, radius, first, mask, near, together);
+                    for child in children(&visit, radius, first, mask, near, together) {
+                        stack.extend(Sight::new(walk, pack, child));
+                    }
                 }
                 _ => painter.draw_parts(parts, order, &visit, near, together),
             }
@@ -299,36 +342,33 @@ pub(crate) fn check(node: &NodeRecord, visit: &Visit, leaf_max: u32) -> Result<(
     }
 }
 
-/// Pushes the children for receivers to whom octant `near` is the nearest, so that it is popped first. No point of theirs
-/// is larger than `radius`.
+/// The children for receivers to whom octant `near` is the nearest, that one last. No point of theirs is larger than `radius`.
 #[inline(always)]
-pub(crate) fn push_children(
-    stack: &mut Vec<Visit>,
+pub(crate) fn children(
     visit: &Visit,
     radius: f32,
     first: NodeIndex,
     mask: u8,
     near: u32,
     lanes: u8,
-) {
+) -> impl Iterator<Item = Visit> {
     let half = visit.half * 0.5;
-    for step in NEAR_TO_FAR.iter().rev() {
-        let octant = near ^ step;
-        if mask >> octant & 1 == 0 {
-            continue;
-        }
-        let rank = (u32::from(mask) & ((1 << octant) - 1)).count_ones();
-        let side = |bit: u32| if octant >> bit & 1 == 1 { half } else { -half };
-        stack.push(Visit {
-            index: NodeIndex(first.0.wrapping_add(rank)),
-            offset: visit.offset + Vec3::new(side(0), side(1), side(2)),
-            half,
-            level: visit.level + 1,
-            path: visit.path << 3 | u64::from(octant),
-            radius,
-            lanes,
-        });
-    }
+    let octants = NEAR_TO_FAR.iter().rev().map(move |step| near ^ step);
+    octants
+        .filter(move |octant| mask >> octant & 1 == 1)
+        .map(move |octant| {
+            let rank = (u32::from(mask) & ((1 << octant) - 1)).count_ones();
+            let side = |bit: u32| if octant >> bit & 1 == 1 { half } else { -half };
+            Visit {
+                index: NodeIndex(first.0.wrapping_add(rank)),
+                offset: visit.offset + Vec3::new(side(0), side(1), side(2)),
+                half,
+                level: visit.level + 1,
+                path: visit.path << 3 | u64::from(octant),
+                radius,
+                lanes,
+            }
+        })
 }
 
 /// Reads a leaf's points.

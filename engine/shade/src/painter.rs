@@ -1,7 +1,7 @@
 //! Draws the elements of a cut into the raster and sums what they add, for eight receivers at a time.
 
 use crate::cluster::{Cluster, SAME_SHEET, SECTION_FILL, is_aligned, is_own_surface, orthonormal_pair, rectangle_of};
-use crate::cut::{Pack, Visit, Walk};
+use crate::cut::{Pack, Sight, Visit, Walk};
 use crate::footprint::{Footprint, Plane};
 use crate::leaf::{Disc, Facet, Part};
 use crate::raster::{Covered, Ink, Raster};
@@ -24,8 +24,6 @@ const OVERHANG: f32 = 0.3;
 const BEHIND_DEPTH: f32 = 1.25;
 /// Distance from a plane, as a share of half a voxel's edge or of a disc's radius, that is no distance.
 const TOUCH: f32 = 1e-3;
-/// Share of covered bits from which it pays to ask whether a voxel is hidden.
-const HIDDEN_TEST_SHARE: f32 = 0.1;
 /// Share of its rectangle that a round cluster must cover to be drawn opaque; thinner ones are drawn with holes.
 const OPAQUE_SHARE: f32 = 0.4;
 /// Area by which a dense piece of a sheet is drawn larger: a rectangle never meets its neighbours exactly, and a closed wall
@@ -65,27 +63,19 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         }
     }
 
-    /// The lanes that may see something of a voxel: it is neither below the horizon nor behind what is drawn already.
-    /// `center` is the voxel's, relative to the receivers.
+    /// The lanes that may still see something of a voxel: it is not behind what is drawn already.
     #[inline(always)]
-    pub(crate) fn seen_by(&self, visit: &Visit, center: Vector<F>) -> u8 {
-        let reach = visit.reach();
-        let below = self.pack.frames.z.dot(center).less(F::splat(-reach));
-        let bits = self.walk.tables.bits();
+    pub(crate) fn seen_by(&self, sight: &Sight<F, WORDS>) -> u8 {
+        let tables = self.walk.tables;
         let covered = self.raster.covered_count();
-        let open = F::Words::splat(bits).greater_signed(covered);
-        let lanes = visit.lanes & open.lanes() & !below.lanes();
-        if lanes == 0 {
-            return 0;
-        }
-        let far = F::splat(1.1 * reach * reach).less(center.length_squared());
-        let worth = covered.greater_signed(F::Words::splat((HIDDEN_TEST_SHARE * bits as f32) as u32));
-        let asked = lanes & (far & worth).lanes();
+        let open = F::Words::splat(tables.bits()).greater_signed(covered);
+        let lanes = sight.visit.lanes & open.lanes();
+        let crowded = covered.greater_signed(F::Words::splat(tables.crowded));
+        let asked = lanes & sight.far & crowded.lanes();
         if asked == 0 {
             return lanes;
         }
-        let local = self.pack.frames.local_from_world(center);
-        lanes & !F::hides_spheres(self.raster, self.walk.tables, &local, reach, asked)
+        lanes & !self.raster.hides(tables, &sight.window, asked)
     }
 
     /// Draws a cluster for some lanes; `center` is its voxel's, `centroid` its own, relative to the receivers.
@@ -115,13 +105,19 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let frames = &self.pack.frames;
         let axis = Vector::splat(cluster.axis);
         let plane = Plane::through(frames, centroid, axis, TOUCH * visit.half);
-        let (footprint, drawn_area) = if cluster.fill >= SECTION_FILL {
+        let weight = self.weight(
+            centroid,
+            #[inline(always)]
+            |direction| cluster.depth(direction),
+        );
+        let (covered, drawn_area) = if cluster.fill >= SECTION_FILL {
             let (of_voxel, of_points) = cluster.section_reach();
             let (of_voxel, of_points) = (Vector::splat(of_voxel), Vector::splat(of_points));
             let low = (center - of_voxel).max(centroid - of_points);
             let high = (center + of_voxel).min(centroid + of_points);
             let section = Footprint::section(frames, low, high, &plane);
-            (section, F::splat(cluster.area / cluster.fill))
+            let covered = self.cover(&section, lanes, None, weight, visit.path);
+            (covered, F::splat(cluster.area / cluster.fill))
         } else {
             let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, axis);
             // Shrunk where the points cover less than the rectangle; it is never made larger.
@@ -131,14 +127,8 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
             let (a, b) = (a * scale, b * scale);
             let sides = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
             let rectangle = Footprint::rectangle(frames.local_from_world(centroid), &plane, sides);
-            (rectangle, four * a * b)
+            (self.cover(&rectangle, lanes, None, weight, visit.path), four * a * b)
         };
-        let weight = self.weight(
-            centroid,
-            #[inline(always)]
-            |direction| cluster.depth(direction),
-        );
-        let covered = self.cover(&footprint, lanes, None, weight, visit.path);
         if let Some(covered) = covered {
             let powers = cluster.side_powers::<F>();
             // One sheet shows all its area; of two the receiver sees the nearer.
@@ -158,7 +148,8 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let distance = centroid.length_squared().sqrt();
         let apart = F::splat(1e-6 * visit.half).less(distance);
         let direction = centroid * (F::splat(1.0) / distance);
-        let shown = cluster.toward(-direction, self.walk.settings.hit_sides);
+        let shown = cluster.toward(-direction);
+        let sides = self.walk.settings.hit_sides;
         let plane = Plane {
             normal: frames.local_from_world(direction),
             distance,
@@ -166,10 +157,10 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, direction);
         let tiny = F::splat(1e-30);
         let rectangle = (F::splat(4.0) * a * b).max(tiny);
-        let visible = shown.area.min(rectangle).max(tiny);
+        let visible = shown.area(sides).min(rectangle).max(tiny);
         let covered = visible / rectangle;
         let density = (covered * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
-        let scale = wall_scale(covered, shown.scattered) * covered.max(F::splat(OPAQUE_SHARE));
+        let scale = wall_scale(covered, shown.scattered()) * covered.max(F::splat(OPAQUE_SHARE));
         let scale = scale.sqrt();
         let (a, b) = (a * scale, b * scale);
         let sides = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
@@ -185,7 +176,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         if let Some(covered) = covered {
             // What hides is taken to be as unlit as the insides of a body.
             let lit = covered.bits_set().select(covered.light / visible, F::splat(0.0));
-            self.radiance = self.radiance + shown.power * lit;
+            self.radiance = self.radiance + shown.power() * lit;
         }
     }
 
@@ -231,17 +222,16 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         if lanes == 0 {
             return;
         }
-        let mut footprint = Footprint::section(
-            frames,
-            self.pack.relative(facet.low),
-            self.pack.relative(facet.high),
-            &plane,
+        let (low, high) = (self.pack.relative(facet.low), self.pack.relative(facet.high));
+        let cuts = facet.cuts().iter().map(
+            #[inline(always)]
+            |cut| {
+                let normal = Vector::splat(cut.normal);
+                let distance = normal.dot(self.pack.relative(cut.point));
+                (frames.local_from_world(normal), distance)
+            },
         );
-        for cut in facet.cuts() {
-            let normal = Vector::splat(cut.normal);
-            let distance = normal.dot(self.pack.relative(cut.point));
-            footprint.cut(&plane, frames.local_from_world(normal), distance);
-        }
+        let footprint = Footprint::section(frames, low, high, &plane).cut(&plane, cuts);
         let weight = self.weight(
             centroid,
             #[inline(always)]
@@ -339,21 +329,21 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
 
     /// Covers a footprint; `None` if nothing of it was open.
     #[inline(always)]
-    fn cover(
+    fn cover<const N: usize>(
         &mut self,
-        footprint: &Footprint<F>,
+        footprint: &Footprint<F, N>,
         lanes: u8,
         density: Option<F>,
         weight: Option<F>,
         seed: u64,
     ) -> Option<Covered<F>> {
-        let ink = Ink {
-            lanes,
-            density,
-            weight,
-            seed,
+        let ink = Ink { density, weight, seed };
+        let tables = self.walk.tables;
+        let covered = if density.is_some() || weight.is_some() {
+            F::cover::<WORDS, N, true>(self.raster, tables, footprint, lanes, &ink)
+        } else {
+            F::cover::<WORDS, N, false>(self.raster, tables, footprint, lanes, &ink)
         };
-        let covered = F::cover(self.raster, self.walk.tables, footprint, &ink);
         if covered.bits_set().lanes() == 0 {
             return None;
         }

@@ -5,7 +5,7 @@
 //! overlap. A ray meets the nearest disc that it passes close to the middle of; position, normal and radiance are blended
 //! over the discs around it at that depth (Zwicker et al. 2001, "Surface Splatting").
 
-use crate::cut::{Visit, check, push_children, read_points};
+use crate::cut::{Visit, check, children, read_points};
 use crate::shader::{ShadeCounters, ShadeError};
 use crate::source::{SceneSource, Upcoming, Wanted};
 use bytemuck::{Pod, Zeroable};
@@ -194,7 +194,7 @@ impl Tracer {
                     let radius = visit.radius.min(node.radius_ratio() * 2.0 * visit.half);
                     let side = |axis: f32, bit: u32| u32::from(axis < 0.0) << bit;
                     let near = side(center.x, 0) | side(center.y, 1) | side(center.z, 2);
-                    push_children(&mut self.stack, &visit, radius, first, mask, near, 1);
+                    self.stack.extend(children(&visit, radius, first, mask, near, 1));
                 }
                 NodeKind::Leaf { first, count } if !small => {
                     read_points(source, first, count, 1, &pending, &mut self.points)?;

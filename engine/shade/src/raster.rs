@@ -10,6 +10,7 @@ use crate::footprint::{Footprint, RowSpan};
 use crate::simd::{Floats, Words};
 use crate::vector::Vector;
 use glam::Vec3;
+use std::ops::Range;
 
 /// Tangents beyond this are the poles.
 const FAR: f32 = 1e6;
@@ -17,11 +18,24 @@ const FAR: f32 = 1e6;
 const WORD_BITS: usize = 32;
 /// Largest number of rows and of columns.
 pub(crate) const RESOLUTION_MAX: usize = 64;
+/// 2^23: floats from here on are integers, so that the last bits of a sum with a small number are that number, rounded ...
+pub(crate) const INTEGER_SHIFT: f32 = 8_388_608.0;
+/// ... and these hold the largest that a raster needs.
+pub(crate) const INTEGER_MASK: u32 = 0x7f;
+
+/// Share of covered bits from which it pays to ask whether a voxel is hidden.
+const HIDDEN_TEST_SHARE: f32 = 0.1;
 
 /// Directions of rows and columns of one resolution.
 #[derive(Clone, Debug)]
 pub(crate) struct RasterTables {
     pub(crate) resolution: usize,
+    /// The same as a float.
+    size: f32,
+    /// Sine of the elevation of the lowest bits.
+    pub(crate) lowest: f32,
+    /// Covered bits from which it pays to ask whether a voxel is hidden.
+    pub(crate) crowded: u32,
     row_sin: [f32; RESOLUTION_MAX],
     row_cos: [f32; RESOLUTION_MAX],
     /// sin and cos of `a` at the middle of each column.
@@ -33,6 +47,9 @@ impl RasterTables {
     pub(crate) fn new(resolution: usize) -> Self {
         let mut tables = Self {
             resolution,
+            size: resolution as f32,
+            lowest: 0.0,
+            crowded: (HIDDEN_TEST_SHARE * (resolution * resolution) as f32) as u32,
             row_sin: [0.0; RESOLUTION_MAX],
             row_cos: [0.0; RESOLUTION_MAX],
             column_sin: [0.0; RESOLUTION_MAX],
@@ -47,6 +64,7 @@ impl RasterTables {
             tables.column_sin[i] = a.sin() as f32;
             tables.column_cos[i] = a.cos() as f32;
         }
+        tables.lowest = tables.row_cos[0] * tables.column_cos[0];
         tables
     }
 
@@ -90,8 +108,6 @@ pub(crate) struct Raster<F: Floats, const WORDS: usize> {
 /// How a footprint is drawn. What is left out follows a pattern that depends on `seed` alone.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Ink<F> {
-    /// Receivers that it is drawn for.
-    pub(crate) lanes: u8,
     /// Share of the footprint that is covered; all if `None`.
     pub(crate) density: Option<F>,
     /// Share of the newly covered bits that count as occluded; all if `None`.
@@ -144,18 +160,26 @@ impl<F: Floats, const WORDS: usize> Raster<F, WORDS> {
         self.covered_count
     }
 
-    /// Covers a footprint's bits and counts those that were open.
+    /// Covers a footprint's bits for some lanes and counts those that were open. Without `PATTERN` it covers and occludes in full,
+    /// and has no use for `ink`.
     #[inline(always)]
-    pub(crate) fn cover(&mut self, tables: &RasterTables, footprint: &Footprint<F>, ink: &Ink<F>) -> Covered<F> {
+    pub(crate) fn cover<const N: usize, const PATTERN: bool>(
+        &mut self,
+        tables: &RasterTables,
+        footprint: &Footprint<F, N>,
+        lanes: u8,
+        ink: &Ink<F>,
+    ) -> Covered<F> {
         let zero = F::Words::splat(0);
-        let lanes = F::Words::from_lanes(ink.lanes);
-        let resolution = F::splat(tables.resolution as f32);
+        let rows = footprint.rows(tables.size, lanes);
+        let lanes = F::Words::from_lanes(lanes);
+        let resolution = F::splat(tables.size);
         let (far, near) = (F::splat(FAR), F::splat(-FAR));
         let (mut count, mut drawn, mut length) = (zero, zero, F::splat(0.0));
-        for row in footprint.rows(tables.resolution, ink.lanes) {
+        for row in rows {
             let (sin, cos) = (F::splat(tables.row_sin[row]), F::splat(tables.row_cos[row]));
             let (mut low, mut high) = (near, far);
-            for half_space in footprint.half_spaces() {
+            for half_space in &footprint.half_spaces {
                 let bound = half_space.y.mul_add(sin, half_space.z * cos).to_bits();
                 // All ones are no number, and lose every comparison.
                 low = (bound | half_space.upper).to_floats().max(low);
@@ -171,14 +195,14 @@ impl<F: Floats, const WORDS: usize> Raster<F, WORDS> {
             drawn = drawn.wrapping_add(met & end.wrapping_sub(first).max_signed(zero));
             for (word, mask) in word_masks::<F, WORDS>(first, end).into_iter().enumerate() {
                 let mut mask = mask & met;
-                if let Some(density) = ink.density {
+                if let (true, Some(density)) = (PATTERN, ink.density) {
                     mask = mask & sparse_bits(ink.seed ^ (row * WORDS + word) as u64, density);
                 }
                 let covered = &mut self.covered[row][word];
                 let newly = mask & !*covered;
                 *covered = *covered | mask;
                 count = count.wrapping_add(newly.count_ones());
-                if let Some(weight) = ink.weight {
+                if let (true, Some(weight)) = (PATTERN, ink.weight) {
                     let kept = newly & sparse_bits(!ink.seed ^ (row * WORDS + word) as u64, weight);
                     self.occluded[row][word] = self.occluded[row][word] | kept;
                 }
@@ -186,40 +210,22 @@ impl<F: Floats, const WORDS: usize> Raster<F, WORDS> {
         }
         self.covered_count = self.covered_count.wrapping_add(count);
         let (bits, drawn) = (count.as_floats(), drawn.as_floats());
-        let light = match ink.density {
-            None => drawn.less(F::splat(EXACT_BITS)).select(bits, bits * (length / drawn)),
-            Some(_) => bits,
+        let light = if PATTERN && ink.density.is_some() {
+            bits
+        } else {
+            drawn.less(F::splat(EXACT_BITS)).select(bits, bits * (length / drawn))
         };
         Covered { bits, light }
     }
 
-    /// The lanes in which every bit that shows the sphere is covered already; `center` in the receivers' frames, farther than
-    /// `radius`. Asks for the whole box of rows and columns around the sphere, which costs far less than its outline and hides
-    /// nearly as much.
+    /// The lanes in which every bit of a window is covered already.
     #[inline(always)]
-    pub(crate) fn hides_spheres(&self, tables: &RasterTables, center: &Vector<F>, radius: f32, lanes: u8) -> u8 {
-        /// Sine of an angle that no rounding exceeds.
-        const SLACK: f32 = 1e-4;
-        let zero = F::splat(0.0);
-        let resolution = F::splat(tables.resolution as f32);
-        let radius = F::splat(radius);
-        // Along the rows the sphere spans the angle to its middle plus and minus its angular radius. Lengths are times the
-        // squared distance.
-        let across = (center.y * center.y + center.z * center.z).sqrt();
-        let tangent = (center.length_squared() - radius * radius).max(zero).sqrt();
-        let (x_tangent, x_radius) = (center.x * tangent, center.x * radius);
-        let (across_tangent, across_radius) = (across * tangent, across * radius);
-        let low = column_of_angle(x_tangent - across_radius, across_tangent + x_radius, resolution);
-        let high = column_of_angle(x_tangent + across_radius, across_tangent - x_radius, resolution);
-        let (first, end) = (rounded(low), rounded(high));
-        let masks: [F::Words; WORDS] = word_masks::<F, WORDS>(first, end);
-        let span = RowSpan::of_spheres(center, radius);
-        let (low, high) = (span.low - F::splat(SLACK), span.high + F::splat(SLACK));
+    pub(crate) fn hides(&self, tables: &RasterTables, window: &Window<F, WORDS>, lanes: u8) -> u8 {
         let mut open = F::Words::splat(0);
-        for row in span.rows(tables.resolution, lanes) {
+        for row in window.rows.clone() {
             let sin = F::splat(tables.row_sin[row]);
-            let shown = low.less(sin) & sin.less(high);
-            for (mask, covered) in masks.iter().zip(&self.covered[row]) {
+            let shown = window.low.less(sin) & sin.less(window.high);
+            for (mask, covered) in window.columns.iter().zip(&self.covered[row]) {
                 open = open | (shown & *mask & !*covered);
             }
         }
@@ -273,6 +279,43 @@ pub(crate) fn for_each_open(bits: &[u64; RESOLUTION_MAX], tables: &RasterTables,
         while open != 0 {
             visit(row, open.trailing_zeros() as usize);
             open &= open - 1;
+        }
+    }
+}
+
+/// The box of rows and columns around spheres: it costs far less than their outlines, and is hidden nearly as often.
+#[derive(Debug)]
+pub(crate) struct Window<F: Floats, const WORDS: usize> {
+    columns: [F::Words; WORDS],
+    /// Sines of row angles.
+    low: F,
+    high: F,
+    /// Rows of all lanes.
+    rows: Range<usize>,
+}
+
+impl<F: Floats, const WORDS: usize> Window<F, WORDS> {
+    /// Around spheres whose centres, in the receivers' frames, are farther than `radius`; where one is not, it means nothing.
+    #[inline(always)]
+    pub(crate) fn of_spheres(tables: &RasterTables, center: &Vector<F>, radius: f32, lanes: u8) -> Self {
+        /// Sine of an angle that no rounding exceeds.
+        const SLACK: f32 = 1e-4;
+        let resolution = F::splat(tables.size);
+        let radius = F::splat(radius);
+        // Along the rows a sphere spans the angle to its middle plus and minus its angular radius. Lengths are times the
+        // squared distance.
+        let across = (center.y * center.y + center.z * center.z).sqrt();
+        let tangent = (center.length_squared() - radius * radius).max(F::splat(0.0)).sqrt();
+        let (x_tangent, x_radius) = (center.x * tangent, center.x * radius);
+        let (across_tangent, across_radius) = (across * tangent, across * radius);
+        let first = column_of_angle(x_tangent - across_radius, across_tangent + x_radius, resolution);
+        let end = column_of_angle(x_tangent + across_radius, across_tangent - x_radius, resolution);
+        let span = RowSpan::of_spheres(center, radius);
+        Self {
+            columns: word_masks::<F, WORDS>(rounded(first), rounded(end)),
+            low: span.low - F::splat(SLACK),
+            high: span.high + F::splat(SLACK),
+            rows: span.rows(tables.size, lanes),
         }
     }
 }
@@ -338,12 +381,9 @@ fn column<F: Floats>(sign: F, y: F, resolution: F) -> F {
 /// Number of column middles below a place along a row.
 #[inline(always)]
 fn rounded<F: Floats>(column: F) -> F::Words {
-    /// 2^23: floats from here on are integers.
-    const INTEGER_SHIFT: f32 = 8_388_608.0;
-    const COLUMN_MASK: u32 = 0x7f;
     // The sum's last bits are the rounded integer. Not a number (a row through a sphere's own axis) becomes any column; its
     // row is known to be missed.
-    (column + F::splat(INTEGER_SHIFT)).to_bits() & F::Words::splat(COLUMN_MASK)
+    (column + F::splat(INTEGER_SHIFT)).to_bits() & F::Words::splat(INTEGER_MASK)
 }
 
 /// Words whose bits are set with probability `density` (in steps of 1/16), always the same for a seed.
@@ -375,14 +415,13 @@ fn splitmix(state: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::footprint::Plane;
+    use crate::footprint::{OF_RECTANGLE, Plane};
     use crate::simd::ScalarFloats;
     use std::f32::consts::PI;
 
     type Scalar64 = Raster<ScalarFloats, 2>;
 
     const SOLID: Ink<ScalarFloats> = Ink {
-        lanes: 1,
         density: None,
         weight: None,
         seed: 1,
@@ -393,7 +432,7 @@ mod tests {
     }
 
     /// A square across z at height 1.
-    fn square(center: Vec3, turn: (f32, f32), half: f32) -> Footprint<ScalarFloats> {
+    fn square(center: Vec3, turn: (f32, f32), half: f32) -> Footprint<ScalarFloats, OF_RECTANGLE> {
         let plane = Plane {
             normal: splat(Vec3::Z),
             distance: ScalarFloats::splat(1.0),
@@ -410,7 +449,7 @@ mod tests {
         for half in [0.2f32, 0.5, 1.0, 3.0] {
             let mut raster = Scalar64::new();
             let square = square(Vec3::Z, (0.893_96, 0.448_14), half);
-            let count = raster.cover(&tables, &square, &SOLID).bits.to_array()[0];
+            let count = raster.cover::<_, false>(&tables, &square, 1, &SOLID).bits.to_array()[0];
             // Form factor of a parallel square from a point below its centre: four times that of a quarter.
             let x = half / (1.0 + half * half).sqrt();
             let quarter = x * (half / (1.0 + half * half).sqrt()).atan() / PI;
@@ -466,14 +505,15 @@ mod tests {
         let mut raster = Raster::<ScalarFloats, 1>::new();
         let place = Vec3::new(0.3, 0.2, 1.0);
         let square = square(place, (1.0, 0.0), 0.4);
-        assert_eq!(raster.hides_spheres(&tables, &splat(place), 0.2, 1), 0);
-        assert!(raster.cover(&tables, &square, &SOLID).bits.to_array()[0] > 0.0);
-        assert_eq!(raster.cover(&tables, &square, &SOLID).bits.to_array()[0], 0.0);
+        let small = Window::of_spheres(&tables, &splat(place), 0.2, 3);
+        let large = Window::of_spheres(&tables, &splat(place), 0.7, 3);
+        assert_eq!(raster.hides(&tables, &small, 1), 0);
+        assert!(raster.cover::<_, false>(&tables, &square, 1, &SOLID).bits.to_array()[0] > 0.0);
         assert_eq!(
-            raster.hides_spheres(&tables, &splat(place), 0.2, 3),
-            1,
-            "the other lane is open"
+            raster.cover::<_, false>(&tables, &square, 1, &SOLID).bits.to_array()[0],
+            0.0
         );
-        assert_eq!(raster.hides_spheres(&tables, &splat(place), 0.7, 1), 0);
+        assert_eq!(raster.hides(&tables, &small, 3), 1, "the other lane is open");
+        assert_eq!(raster.hides(&tables, &large, 1), 0);
     }
 }

@@ -260,6 +260,7 @@ impl<S: SceneSource> Group<'_, S> {
         let tables = self.walk.tables;
         let bit = 1.0 / tables.bits() as f32;
         let mut raster = Raster::<F, WORDS>::new();
+        let mut stack = Vec::new();
         for order in self.order.chunks(LANES) {
             let mut receivers = [Receiver::default(); LANES];
             for (receiver, (_, index)) in receivers.iter_mut().zip(order) {
@@ -274,7 +275,15 @@ impl<S: SceneSource> Group<'_, S> {
                 std::array::from_fn(|lane| Frame::from_normal(receivers[lane.min(receivers.len() - 1)].normal));
             let pack = Pack::new(self.walk.info, receivers, &frames);
             self.source.begin_pack();
-            let seen = gather(&self.walk, &pack, self.source, &mut raster, self.scratch, self.counters)?;
+            let seen = gather(
+                &self.walk,
+                &pack,
+                self.source,
+                &mut raster,
+                &mut stack,
+                self.scratch,
+                self.counters,
+            )?;
             let (x, y, z) = (
                 seen.radiance.x.to_array(),
                 seen.radiance.y.to_array(),

@@ -6,7 +6,6 @@
 
 use crate::footprint::Footprint;
 use crate::raster::{Covered, Ink, Raster, RasterTables};
-use crate::vector::Vector;
 use half::f16;
 use std::fmt::Debug;
 use std::ops::{Add, BitAnd, BitOr, BitXor, Div, Mul, Neg, Not, Sub};
@@ -40,21 +39,13 @@ pub(crate) trait Floats:
     fn to_bits(self) -> Self::Words;
 
     /// [`Raster::cover`], compiled on its own.
-    fn cover<const WORDS: usize>(
+    fn cover<const WORDS: usize, const N: usize, const PATTERN: bool>(
         raster: &mut Raster<Self, WORDS>,
         tables: &RasterTables,
-        footprint: &Footprint<Self>,
+        footprint: &Footprint<Self, N>,
+        lanes: u8,
         ink: &Ink<Self>,
     ) -> Covered<Self>;
-
-    /// [`Raster::hides_spheres`], compiled on its own.
-    fn hides_spheres<const WORDS: usize>(
-        raster: &Raster<Self, WORDS>,
-        tables: &RasterTables,
-        center: &Vector<Self>,
-        radius: f32,
-        lanes: u8,
-    ) -> u8;
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
@@ -283,23 +274,14 @@ impl Floats for ScalarFloats {
         ScalarWords(self.0.map(f32::to_bits))
     }
 
-    fn cover<const WORDS: usize>(
+    fn cover<const WORDS: usize, const N: usize, const PATTERN: bool>(
         raster: &mut Raster<Self, WORDS>,
         tables: &RasterTables,
-        footprint: &Footprint<Self>,
+        footprint: &Footprint<Self, N>,
+        lanes: u8,
         ink: &Ink<Self>,
     ) -> Covered<Self> {
-        raster.cover(tables, footprint, ink)
-    }
-
-    fn hides_spheres<const WORDS: usize>(
-        raster: &Raster<Self, WORDS>,
-        tables: &RasterTables,
-        center: &Vector<Self>,
-        radius: f32,
-        lanes: u8,
-    ) -> u8 {
-        raster.hides_spheres(tables, center, radius, lanes)
+        raster.cover::<N, PATTERN>(tables, footprint, lanes, ink)
     }
 }
 
@@ -550,45 +532,25 @@ mod avx2 {
         }
 
         #[inline(always)]
-        fn cover<const WORDS: usize>(
+        fn cover<const WORDS: usize, const N: usize, const PATTERN: bool>(
             raster: &mut Raster<Self, WORDS>,
             tables: &RasterTables,
-            footprint: &Footprint<Self>,
+            footprint: &Footprint<Self, N>,
+            lanes: u8,
             ink: &Ink<Self>,
         ) -> Covered<Self> {
             #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,lzcnt,popcnt")]
-            fn compiled<const WORDS: usize>(
+            fn compiled<const WORDS: usize, const N: usize, const PATTERN: bool>(
                 raster: &mut Raster<Avx2Floats, WORDS>,
                 tables: &RasterTables,
-                footprint: &Footprint<Avx2Floats>,
+                footprint: &Footprint<Avx2Floats, N>,
+                lanes: u8,
                 ink: &Ink<Avx2Floats>,
             ) -> Covered<Avx2Floats> {
-                raster.cover(tables, footprint, ink)
+                raster.cover::<N, PATTERN>(tables, footprint, lanes, ink)
             }
             // SAFETY: as for the operators.
-            unsafe { compiled(raster, tables, footprint, ink) }
-        }
-
-        #[inline(always)]
-        fn hides_spheres<const WORDS: usize>(
-            raster: &Raster<Self, WORDS>,
-            tables: &RasterTables,
-            center: &Vector<Self>,
-            radius: f32,
-            lanes: u8,
-        ) -> u8 {
-            #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,lzcnt,popcnt")]
-            fn compiled<const WORDS: usize>(
-                raster: &Raster<Avx2Floats, WORDS>,
-                tables: &RasterTables,
-                center: &Vector<Avx2Floats>,
-                radius: f32,
-                lanes: u8,
-            ) -> u8 {
-                raster.hides_spheres(tables, center, radius, lanes)
-            }
-            // SAFETY: as for the operators.
-            unsafe { compiled(raster, tables, center, radius, lanes) }
+            unsafe { compiled::<WORDS, N, PATTERN>(raster, tables, footprint, lanes, ink) }
         }
     }
 
