@@ -207,13 +207,13 @@ async fn scene_of_another_version_page_size_or_endianness_is_refused_naming_both
     site.succeed("build", site.build("s.pbgi")).await;
     let folder = site.daemon.folder.path();
     let manifest = std::fs::read_to_string(folder.join("s.pbgi/manifest.toml")).unwrap();
-    let version_at = manifest.find("version = 3").unwrap() + "version = ".len();
+    let version_at = manifest.find("version = 4").unwrap() + "version = ".len();
     let per_page = |count: u32| count.to_le_bytes().to_vec();
     let cases: [(&str, usize, Vec<u8>, [&str; 2]); 8] = [
-        ("manifest.toml", version_at, b"9".to_vec(), ["3", "9"]),
-        ("nodes.pages", 8, vec![9, 0, 0, 0], ["3", "9"]),
+        ("manifest.toml", version_at, b"9".to_vec(), ["4", "9"]),
+        ("nodes.pages", 8, vec![9, 0, 0, 0], ["4", "9"]),
         // The version as a big-endian machine would write it.
-        ("points.pages", 8, vec![0, 0, 0, 1], ["3", "16777216"]),
+        ("points.pages", 8, vec![0, 0, 0, 1], ["4", "16777216"]),
         (
             "nodes.pages",
             0,

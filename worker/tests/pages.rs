@@ -17,7 +17,7 @@ use std::time::Duration;
 
 const MOUNT: MountId = MountId { slot: 1, generation: 9 };
 const RECORDS_PER_PAGE: u32 = 16;
-const NODE_BYTES: usize = 116;
+const NODE_BYTES: usize = 128;
 const POINT_BYTES: usize = 32;
 /// Pages of each file but the last are full.
 const NODES: u64 = 16 * 20 - 3;

@@ -241,7 +241,7 @@ mod tests {
         };
         let text = describe(&info);
         assert!(
-            text.contains("the scene is empty") && text.contains("0 of 29.0 KiB"),
+            text.contains("the scene is empty") && text.contains("0 of 32.0 KiB"),
             "{text}"
         );
     }

@@ -3,7 +3,7 @@
 use crate::coverage::Coverage;
 use crate::limits::HALF_MAX;
 use crate::morton::Quantizer;
-use crate::node::NodeAttributes;
+use crate::node::{FOLD_TERMS, NodeAttributes};
 use crate::pack::pack_harmonics;
 use crate::point::PointRecord;
 use crate::section::voxel_section_area;
@@ -21,6 +21,8 @@ pub struct ClusterAccumulator {
     first_moment: DVec3,
     /// Sum of area times position outer position, with the disc's own extent: xx, yy, zz, xy, xz, yz.
     second_moment: [f64; 6],
+    /// Sum of area times xx, yy, xy, xz, yz of normal outer normal times position.
+    fold_moments: [DVec3; FOLD_TERMS],
     /// Sum of area times normal outer normal: xx, yy, zz, xy, xz, yz.
     normal_moment: [f64; 6],
     /// Light of the front and of the back.
@@ -55,6 +57,7 @@ impl Default for ClusterAccumulator {
             sh: [[0.0; 4]; SH_TERMS],
             first_moment: DVec3::ZERO,
             second_moment: [0.0; 6],
+            fold_moments: [DVec3::ZERO; FOLD_TERMS],
             normal_moment: [0.0; 6],
             light: [LightSums::default(); 2],
             coverage: Coverage::default(),
@@ -94,6 +97,9 @@ impl ClusterAccumulator {
         self.first_moment += position * area;
         let outer_position = outer(position);
         let outer_normal = outer(normal);
+        for (moment, product) in self.fold_moments.iter_mut().zip(fold_terms(&outer_normal)) {
+            *moment += position * (area * product);
+        }
         for i in 0..6 {
             let identity = if i < 3 { 1.0 } else { 0.0 };
             self.second_moment[i] += area * (outer_position[i] + spread * (identity - outer_normal[i]));
@@ -117,6 +123,9 @@ impl ClusterAccumulator {
             }
         }
         self.first_moment += child.first_moment;
+        for (moment, other) in self.fold_moments.iter_mut().zip(&child.fold_moments) {
+            *moment += other;
+        }
         for i in 0..6 {
             self.second_moment[i] += child.second_moment[i];
             self.normal_moment[i] += child.normal_moment[i];
@@ -164,10 +173,20 @@ impl ClusterAccumulator {
             },
             covariance,
             variation: self.variation(),
+            folds: self.folds(mean, edge),
             visible: self.coverage.finish(&covariance, edge),
             sh,
         };
         FinalizedCluster { attributes, clamped }
+    }
+
+    /// See [`NodeAttributes::folds`].
+    fn folds(&self, mean: DVec3, edge: f64) -> [[f32; FOLD_TERMS]; 3] {
+        let products = fold_terms(&self.normal_moment);
+        let scale = 1.0 / (self.coverage.area * edge);
+        let fold = |term: usize| (self.fold_moments[term] - mean * products[term]) * scale;
+        let folds: [DVec3; FOLD_TERMS] = std::array::from_fn(fold);
+        std::array::from_fn(|axis| folds.map(|fold| fold[axis] as f32))
     }
 
     /// See [`NodeAttributes::variation`].
@@ -219,6 +238,11 @@ impl ClusterAccumulator {
 /// Upper triangle of `v v^T`: xx, yy, zz, xy, xz, yz.
 fn outer(v: DVec3) -> [f64; 6] {
     [v.x * v.x, v.y * v.y, v.z * v.z, v.x * v.y, v.x * v.z, v.y * v.z]
+}
+
+/// Of a symmetric matrix as xx, yy, zz, xy, xz, yz whose trace is known.
+fn fold_terms(m: &[f64; 6]) -> [f64; FOLD_TERMS] {
+    [m[0], m[1], m[3], m[4], m[5]]
 }
 
 /// `v^T M v` for a symmetric matrix as xx, yy, zz, xy, xz, yz.
@@ -335,6 +359,22 @@ mod tests {
         let mut points = wall([1.0, 0.0, 0.0], [0.0; 3]);
         points.extend(wall([0.0, 1.0, 0.0], [0.0; 3]));
         assert!((variation(&points) - 1.0).abs() < 1e-3, "{}", variation(&points));
+    }
+
+    #[test]
+    fn two_walls_that_meet_are_seen_off_their_centroid() {
+        // One faces z and ends at x = -1, the other faces x and stands there.
+        let mut points = wall([1.0; 3], [0.0; 3]);
+        points.extend(wall([1.0; 3], [0.0; 3]).iter().map(|point| {
+            let [x, y, _] = point.position;
+            PointRecord::new([-1.0, y, x], [1.0, 0.0, 0.0], point.radius, point.sides()).unwrap()
+        }));
+        let node = summed(&points).finalize(Voxel::ROOT, &quantizer()).attributes;
+        assert!(node.centroid.distance(Vec3::new(-0.5, 0.0, 0.0)) < 1e-6);
+        // What faces x, half of all, is a quarter of the edge to the left of the centroid.
+        let [x, y, z] = node.folds;
+        assert!((x[0] + 0.125).abs() < 1e-6 && x[1].abs() < 1e-6, "{x:?}");
+        assert!(y.iter().chain(&z).all(|fold| fold.abs() < 1e-6), "{y:?} {z:?}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The node: a voxel's cluster as it lies in files and pages, 116 bytes.
+//! The node: a voxel's cluster as it lies in files and pages, 128 bytes.
 
 use crate::ids::{NodeIndex, PointIndex};
 use crate::limits::MORTON_BITS;
@@ -13,13 +13,17 @@ use std::sync::LazyLock;
 /// One octree node with its cluster.
 ///
 /// ```text
-/// byte 0         12      16     20       24       25     26     27    28           40                       112         113    116
-///      | centroid | first | span | normal | level  |radius|spread| fill | covariance | sh                     | variation |visible|
-///      | 3 x f32  | u32   | u32  | 2 x i16| + kind | code | code | code | 6 x f16    | 9 x (area, r, g, b) f16| code      |3 codes|
+/// byte 0         12      16     20       24       25     26     27    28
+///      | centroid | first | span | normal | level  |radius|spread| fill |
+///      | 3 x f32  | u32   | u32  | 2 x i16| + kind | code | code | code |
+///
+/// byte 28          40                        112         113       116         128
+///      | covariance | sh                      | variation | visible | folds     |
+///      | 6 x f16    | 9 x (area, r, g, b) f16 | code      | 3 codes | 3 x 5 in u32
 /// ```
 ///
 /// Siblings are contiguous and never cross a page, so a first child and a mask replace the paper's eight indices; the room
-/// goes to the footprint (covariance, mean normal, spread, fill, visible share).
+/// goes to the footprint (covariance, mean normal, spread, fill, visible share, folds).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct NodeRecord {
@@ -40,9 +44,10 @@ pub struct NodeRecord {
     pub sh: [[f16; 4]; SH_TERMS],
     variation_code: u8,
     visible_codes: [u8; 3],
+    fold_codes: [u32; 3],
 }
 
-const _: () = assert!(size_of::<NodeRecord>() == 116);
+const _: () = assert!(size_of::<NodeRecord>() == 128);
 
 /// What lies below a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,6 +94,8 @@ pub struct NodeAttributes {
     pub variation: f32,
     /// See [`NodeRecord::visible`].
     pub visible: Vec3,
+    /// See [`NodeRecord::folds`].
+    pub folds: [[f32; FOLD_TERMS]; 3],
     /// See [`NodeRecord::sh`], already normalised.
     pub sh: [[f16; 4]; SH_TERMS],
 }
@@ -109,6 +116,28 @@ static RADIUS_RATIOS: LazyLock<[f32; 256]> = LazyLock::new(|| {
 const FILL_STEPS: f32 = 64.0;
 /// Of shares from 0 to 1.
 const SHARE_STEPS: f32 = 255.0;
+
+/// Numbers of one component of [`NodeRecord::folds`].
+pub const FOLD_TERMS: usize = 5;
+/// Bits of one of them: five fit a word.
+const FOLD_BITS: u32 = 6;
+/// The largest code stands for a quarter, which is more than folded sheets reach.
+const FOLD_STEPS: f32 = 124.0;
+
+fn pack_fold(terms: [f32; FOLD_TERMS]) -> u32 {
+    let most = ((1 << (FOLD_BITS - 1)) - 1) as f32;
+    let code = |term: f32| (term * FOLD_STEPS).round().clamp(-most, most) as i32 as u32 & ((1 << FOLD_BITS) - 1);
+    terms.iter().rev().fold(0, |word, term| word << FOLD_BITS | code(*term))
+}
+
+#[inline]
+fn unpack_fold(word: u32) -> [f32; FOLD_TERMS] {
+    std::array::from_fn(|term| {
+        // Shifted up and down again for its sign.
+        let up = word << (u32::BITS - FOLD_BITS * (term as u32 + 1));
+        (up as i32 >> (u32::BITS - FOLD_BITS)) as f32 * (1.0 / FOLD_STEPS)
+    })
+}
 
 fn share_code(share: f32) -> u8 {
     (share.clamp(0.0, 1.0) * SHARE_STEPS).round() as u8
@@ -144,6 +173,7 @@ impl NodeRecord {
             sh: attributes.sh,
             variation_code: (attributes.variation * SHARE_STEPS).ceil() as u8,
             visible_codes: attributes.visible.to_array().map(share_code),
+            fold_codes: attributes.folds.map(pack_fold),
         }
     }
 
@@ -172,6 +202,13 @@ impl NodeRecord {
                 count: self.span,
             }
         }
+    }
+
+    /// How normals go with places: the mean over the discs' areas of `(xx, yy, xy, xz, yz)` of a normal's outer product with
+    /// itself, times x, y and z of the place relative to the centroid, over the voxel's edge. `zz` is minus the sum of `xx` and `yy`.
+    #[inline]
+    pub fn folds(&self) -> [[f32; FOLD_TERMS]; 3] {
+        self.fold_codes.map(unpack_fold)
     }
 
     /// Replaces the first child of an inner node, when its children find their final place.
@@ -215,5 +252,22 @@ impl NodeRecord {
     #[inline]
     pub fn variation(&self) -> f32 {
         f32::from(self.variation_code) / SHARE_STEPS
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn folds_come_back_to_half_a_step_and_large_ones_as_the_largest() {
+        let folds = [0.125, -0.25, 0.0, 0.004, -0.1];
+        for (given, found) in folds.iter().zip(unpack_fold(pack_fold(folds))) {
+            assert!((given - found).abs() <= 0.5 / FOLD_STEPS, "{given} {found}");
+        }
+        assert_eq!(
+            unpack_fold(pack_fold([9.0, -9.0, 0.25, 0.0, -0.25])),
+            [0.25, -0.25, 0.25, 0.0, -0.25]
+        );
     }
 }

@@ -7,6 +7,7 @@ use glam::{Vec2, Vec3};
 use half::f16;
 use pbgi_core::cluster::separate_sides;
 use pbgi_core::coverage::scattered;
+use pbgi_core::node::FOLD_TERMS;
 use pbgi_core::pack::area_normaliser;
 use pbgi_core::sh::{BASIS_FACTORS, SH_TERMS, basis};
 use pbgi_core::{HitSides, NodeRecord};
@@ -244,6 +245,33 @@ impl<F: Floats> Shown<'_, F> {
         shown.max(F::splat(0.0)) * F::splat(self.cluster.normaliser) * visible
     }
 
+    /// From the centroid of all discs to that of what is seen of them.
+    #[inline(always)]
+    pub(crate) fn shift(&self) -> Vector<F> {
+        /// What the second band of `|cos|` adds to a constant, per squared cosine.
+        const SQUARED_COSINE: f32 = 15.0 / 16.0;
+        let [even, _] = self.bands(0);
+        let area = (even + even) * F::splat(self.cluster.normaliser);
+        let d = self.direction;
+        let (two, zz) = (F::splat(2.0), d.z * d.z);
+        let terms = [
+            d.x * d.x - zz,
+            d.y * d.y - zz,
+            two * d.x * d.y,
+            two * d.x * d.z,
+            two * d.y * d.z,
+        ];
+        let [x, y, z] = self.cluster.node.folds();
+        // Of what is never seen there is no middle.
+        let least = (1e-3 * self.cluster.area).max(f32::MIN_POSITIVE);
+        let scale = F::splat(SQUARED_COSINE * self.cluster.edge * self.cluster.area) / area.max(F::splat(least));
+        Vector {
+            x: along(&terms, &x) * scale,
+            y: along(&terms, &y) * scale,
+            z: along(&terms, &z) * scale,
+        }
+    }
+
     /// Radiance times projected area.
     #[inline(always)]
     pub(crate) fn power(&self) -> Vector<F> {
@@ -278,6 +306,16 @@ impl<F: Floats> Shown<'_, F> {
         let odd = with(3, with(2, with(1, zero)));
         [even, odd]
     }
+}
+
+/// The sum of products of two rows.
+#[inline(always)]
+fn along<F: Floats>(terms: &[F; FOLD_TERMS], factors: &[f32; FOLD_TERMS]) -> F {
+    let mut sum = terms[0] * F::splat(factors[0]);
+    for (term, factor) in terms[1..].iter().zip(&factors[1..]) {
+        sum = term.mul_add(F::splat(*factor), sum);
+    }
+    sum
 }
 
 /// The nine basis functions in unit directions; see [`basis`].

@@ -160,11 +160,18 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let visible = shown.area(sides).min(rectangle).max(tiny);
         let covered = visible / rectangle;
         let density = (covered * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
-        let scale = wall_scale(covered, shown.scattered()) * covered.max(F::splat(OPAQUE_SHARE));
+        let scattered = shown.scattered();
+        let scale = wall_scale(covered, scattered) * covered.max(F::splat(OPAQUE_SHARE));
         let scale = scale.sqrt();
         let (a, b) = (a * scale, b * scale);
         let sides = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
-        let footprint = Footprint::rectangle(frames.local_from_world(centroid), &plane, sides);
+        // Of leaves, chance says which are seen, not which way they face.
+        let middle = if scattered < 1.0 {
+            centroid + shown.shift() * F::splat(1.0 - scattered)
+        } else {
+            centroid
+        };
+        let footprint = Footprint::rectangle(frames.local_from_world(middle), &plane, sides);
         let weight = self.weight(
             centroid,
             #[inline(always)]

@@ -125,6 +125,7 @@ fn bomb(info: &mut SceneInfo) -> ArraySource {
         spread: 0.0,
         fill: 0.0,
         variation: 0.0,
+        folds: [[0.0; 5]; 3],
         visible: Vec3::ONE,
         covariance: [0.1, 0.0, 0.1, 0.0, 0.0, 0.0],
         sh: Default::default(),

@@ -13,7 +13,7 @@ use std::sync::Arc;
 pub const MANIFEST_NAME: &str = "manifest.toml";
 
 const FORMAT: &str = "pbgi scene";
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 const PREAMBLE: &str =
     "# A built octree. Written whole and never changed: the last line is a checksum of those above it.\n";
 const CHECKSUM_LABEL: &str = "# crc32c ";

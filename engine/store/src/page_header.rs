@@ -10,7 +10,7 @@ use std::path::Path;
 const MAGIC: [u8; 8] = [0x89, b'P', b'B', b'G', b'\r', b'\n', 0x1a, b'\n'];
 
 /// Version of the format; readers accept no other.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
 const CHECKSUM_AT: usize = HEADER_BYTES - 4;
 
@@ -245,11 +245,11 @@ mod tests {
     fn a_foreign_version_layout_or_kind_is_refused_naming_both_values() {
         let cases: [(usize, &[u8], &str, &str); 6] = [
             (0, &[0x42], "895042470d0a1a0a", "425042470d0a1a0a"),
-            (8, &[4], "needs 3", "has 4"),
+            (8, &[5], "needs 4", "has 5"),
             // A big-endian writer.
-            (8, &[0, 0, 0, 1], "needs 3", "has 16777216"),
+            (8, &[0, 0, 0, 1], "needs 4", "has 16777216"),
             (12, &[2], "needs 1", "has 2"),
-            (16, &[120], "needs 116", "has 120"),
+            (16, &[120], "needs 128", "has 120"),
             (20, &[3, 0], "16..=131072", "has 3"),
         ];
         for (offset, patch, expected, actual) in cases {

@@ -4,7 +4,7 @@
 use pbgi_cache::{CacheOwner, CacheView, LoadError, LocalCache, PoolLayout, Segment, SegmentLayout};
 use pbgi_core::{BuildId, BuildSettings, MountId, PageKey, PageKind, PageNo, SceneInfo};
 
-pub(crate) const PAGE_BYTES: usize = 3712;
+pub(crate) const PAGE_BYTES: usize = 4096;
 pub(crate) const PAGES: u32 = 4096;
 pub(crate) const MOUNT: MountId = MountId { slot: 3, generation: 1 };
 pub(crate) const OTHER_MOUNT: MountId = MountId { slot: 4, generation: 1 };
@@ -27,12 +27,12 @@ pub(crate) fn point(page: u32) -> PageKey {
 pub(crate) fn scene(pages: u32) -> SceneInfo {
     let settings = BuildSettings {
         nodes_per_page: 32,
-        points_per_page: 116,
+        points_per_page: 128,
         ..BuildSettings::default()
     };
     let info = SceneInfo {
         build_id: BuildId(1),
-        point_count: u64::from(pages) * 116,
+        point_count: u64::from(pages) * 128,
         node_count: u64::from(pages) * 32,
         node_slots: u64::from(pages) * 32,
         root: None,

@@ -191,15 +191,15 @@ fn another_version_or_unknown_field_is_refused() {
 
     fs::write(
         &file,
-        sealed(body.replace("version = 3", "version = 9\nshape = \"round\"")),
+        sealed(body.replace("version = 4", "version = 9\nshape = \"round\"")),
     )
     .unwrap();
     let error = Scene::open(&path).err().unwrap().to_string();
-    assert!(error.contains("needs 3, the file has 9"), "{error}");
+    assert!(error.contains("needs 4, the file has 9"), "{error}");
 
     fs::write(
         &file,
-        sealed(body.replace("version = 3", "version = 3\nshape = \"round\"")),
+        sealed(body.replace("version = 4", "version = 4\nshape = \"round\"")),
     )
     .unwrap();
     let error = Scene::open(&path).err().unwrap().to_string();
