@@ -264,6 +264,7 @@ pub(crate) fn gather<F: Floats, S: SceneSource, const WORDS: usize>(
         } else {
             let apart = F::splat(visit.apart()).less(sight.distance);
             let (from, from_stretched) = cluster.accepted_from_squared(walk.settings.max_solid_angle);
+            // Squared, and the larger the less its light counts.
             let distance = centroid.length_squared() / sight.cosine;
             let accepted = lanes & (apart & F::splat(from).less(distance)).lanes();
             let stretched = lanes & !accepted & (apart & F::splat(from_stretched).less(distance)).lanes();
