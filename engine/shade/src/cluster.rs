@@ -236,16 +236,20 @@ impl<F: Floats> Shown<'_, F> {
             HitSides::Front => even + odd,
             HitSides::Back => even - odd,
         };
-        // Along an axis as the node says, between axes by the squares of the cosines.
-        let visible = Vector::splat(self.cluster.node.visible());
-        let direction = self.direction;
-        let visible = direction.x * direction.x * visible.x
-            + direction.y * direction.y * visible.y
-            + direction.z * direction.z * visible.z;
-        shown.max(F::splat(0.0)) * F::splat(self.cluster.normaliser) * visible
+        shown.max(F::splat(0.0)) * F::splat(self.cluster.normaliser) * self.visible()
     }
 
-    /// From the centroid of all discs to that of what is seen of them.
+    /// Share that the cluster does not hide of itself: along an axis as the node says, between axes by the squares of the cosines.
+    #[inline(always)]
+    fn visible(&self) -> F {
+        let visible = Vector::splat(self.cluster.node.visible());
+        let direction = self.direction;
+        direction.x * direction.x * visible.x
+            + direction.y * direction.y * visible.y
+            + direction.z * direction.z * visible.z
+    }
+
+    /// From the centroid of all discs to that of what is seen of them. A body hides half of itself; which half, normals do not tell.
     #[inline(always)]
     pub(crate) fn shift(&self) -> Vector<F> {
         /// What the second band of `|cos|` adds to a constant, per squared cosine.
@@ -265,6 +269,8 @@ impl<F: Floats> Shown<'_, F> {
         // Of what is never seen there is no middle.
         let least = (1e-3 * self.cluster.area).max(f32::MIN_POSITIVE);
         let scale = F::splat(SQUARED_COSINE * self.cluster.edge * self.cluster.area) / area.max(F::splat(least));
+        let visible = self.visible();
+        let scale = scale * (visible + visible - F::splat(1.0)).max(F::splat(0.0));
         Vector {
             x: along(&terms, &x) * scale,
             y: along(&terms, &y) * scale,
