@@ -4,7 +4,7 @@
 use pbgi_core::{BuildId, BuildSettings, PointRecord, Quantizer};
 
 /// Counts changes of the construction that change the bytes for the same input.
-const CONSTRUCTION_VERSION: u64 = 5;
+const CONSTRUCTION_VERSION: u64 = 6;
 
 /// Odd constants without pattern: the fractions of square roots of primes.
 const KEYS: [u64; 8] = [

@@ -8,7 +8,8 @@
 use crate::point::PointRecord;
 use glam::{DVec3, Vec3};
 
-/// Length of the mean normal from which the discs of a cluster are one sheet, and up to which they face everywhere.
+/// Length of the mean normal from which the discs of a cluster are one sheet, and up to which they face everywhere; along an axis, how
+/// much of what is shown faces one way.
 const SHEET_NORMAL: f32 = 0.6;
 const SCATTERED_NORMAL: f32 = 0.2;
 
@@ -20,12 +21,12 @@ const NOTHING: f64 = 1e-6;
 pub(crate) struct Coverage {
     /// Sum of areas.
     pub(crate) area: f64,
-    /// Sum of the squares of areas.
-    area_squares: f64,
     /// Sum of area times normal.
     pub(crate) normal: DVec3,
     /// Sum of area times the normal's part along each axis: what is seen along it, hidden discs too.
     shown: DVec3,
+    /// Sum of the squares of what discs show along each axis.
+    shown_squares: DVec3,
     children: [Option<Child>; 8],
     /// Shares of the voxel's faces, once they are known.
     covered: DVec3,
@@ -35,7 +36,7 @@ pub(crate) struct Coverage {
 struct Child {
     covered: DVec3,
     normal: DVec3,
-    scattered: f64,
+    scattered: DVec3,
 }
 
 impl Coverage {
@@ -43,17 +44,18 @@ impl Coverage {
     pub(crate) fn add(&mut self, point: &PointRecord, area: f64) {
         let normal = point.normal().as_dvec3();
         self.area += area;
-        self.area_squares += area * area;
-        self.normal += normal * area;
-        self.shown += normal.abs() * area;
+        let seen = normal * area;
+        self.normal += seen;
+        self.shown += seen.abs();
+        self.shown_squares += seen * seen;
     }
 
     /// Adds what the child in `octant` covers, which is known.
     pub(crate) fn merge(&mut self, octant: u32, child: &Self) {
         self.area += child.area;
-        self.area_squares += child.area_squares;
         self.normal += child.normal;
         self.shown += child.shown;
+        self.shown_squares += child.shown_squares;
         self.children[octant as usize] = Some(Child {
             covered: child.covered,
             normal: child.normal,
@@ -73,7 +75,7 @@ impl Coverage {
             let by_chance = DVec3::from_array(std::array::from_fn(|axis| {
                 rectangle[axis] * covered_by_chance(shown[axis] / rectangle[axis])
             }));
-            shown.lerp(by_chance, self.scattered())
+            shown + (by_chance - shown) * self.scattered()
         };
         let share = |axis: usize| {
             if shown[axis] > NOTHING {
@@ -97,19 +99,24 @@ impl Coverage {
         columns.sum::<f64>() / 4.0
     }
 
-    fn scattered(&self) -> f64 {
-        scattered_pairs(self.normal, self.area, self.area_squares)
+    /// How much of what is seen along each axis are discs that face both ways. Ground with trees is a sheet from above and a crowd from
+    /// its side.
+    fn scattered(&self) -> DVec3 {
+        DVec3::from_array(std::array::from_fn(|axis| {
+            scattered_pairs(self.normal[axis].powi(2), self.shown[axis], self.shown_squares[axis])
+        }))
     }
 }
 
-/// See [`scattered`]; from sums over discs of area times normal, of areas and of the squares of areas. It looks at all pairs of
-/// discs, so that a few are not taken for a sheet because their normals do not cancel out.
-pub fn scattered_pairs(normal: DVec3, area: f64, area_squares: f64) -> f64 {
+/// See [`scattered`]; from the square of a sum over discs of area times normal, the sum of areas and that of their squares, all of them
+/// as they are or as seen along an axis. It looks at all pairs of discs, so that a few are not taken for a sheet because their normals
+/// do not cancel out.
+pub fn scattered_pairs(normal_squared: f64, area: f64, area_squares: f64) -> f64 {
     let pairs = area * area - area_squares;
     if pairs <= NOTHING * area * area {
         return 0.0;
     }
-    let mean_square = (normal.length_squared() - area_squares) / pairs;
+    let mean_square = (normal_squared - area_squares) / pairs;
     scattered(mean_square.max(0.0).sqrt() as f32).into()
 }
 
@@ -132,7 +139,7 @@ impl Child {
             (a + b).min(larger.max(1.0))
         };
         let by_chance = a + b * (1.0 - a.min(1.0));
-        surfaces + self.scattered.min(other.scattered) * (by_chance - surfaces)
+        surfaces + self.scattered[axis].min(other.scattered[axis]) * (by_chance - surfaces)
     }
 }
 
@@ -206,14 +213,16 @@ mod tests {
     }
 
     #[test]
-    fn one_disc_and_a_few_of_any_normals_are_no_sheet_by_accident() {
-        assert_eq!(covered(&[([0.0, 1.0, 0.0], 1.0)], &FILLED).0.scattered(), 0.0);
-        let (few, _) = covered(
-            &[([1.0, 0.0, 0.0], 1.0), ([0.0, 1.0, 0.0], 1.0), ([0.0, 0.0, 1.0], 1.0)],
-            &FILLED,
-        );
-        // Their mean normal is 0.58 long.
-        assert_eq!(few.scattered(), 1.0);
+    fn one_disc_is_no_crowd_and_ground_with_leaves_is_one_from_its_side() {
+        let scattered = |points: &[([f32; 3], f32)]| covered(points, &FILLED).0.scattered();
+        let side = 3f32.sqrt().recip();
+        assert_eq!(scattered(&[([side; 3], 1.0)]), DVec3::ZERO);
+        let four = [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]];
+        let leaves = four.map(|normal| (normal.map(|part| part * side), 0.1));
+        assert_eq!(scattered(&leaves), DVec3::ONE);
+        let mut forest = vec![([0.0, 0.0, 1.0], 1.0); 4];
+        forest.extend(leaves);
+        assert_eq!(scattered(&forest), DVec3::new(1.0, 1.0, 0.0));
     }
 
     #[test]

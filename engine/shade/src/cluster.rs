@@ -16,6 +16,9 @@ use pbgi_core::{HitSides, NodeRecord};
 const AREA_TERM: f32 = 0.886_226_9;
 /// The same of the three linear terms, over the sum of its discs' normals times their areas.
 const NORMAL_TERM: f32 = 1.023_326_7;
+/// What the second band of `|cos|` makes of it: a constant, and a part by the squared cosine.
+const CONSTANT_COSINE: f32 = 3.0 / 16.0;
+const SQUARED_COSINE: f32 = 15.0 / 16.0;
 /// A cluster whose normals spread less than this (root mean square sine) and that is thinner than [`FLAT_THICKNESS`] is a
 /// piece of a plane.
 const FLAT_SPREAD: f32 = 0.25;
@@ -48,6 +51,15 @@ const INSIDE_DEPTH: f32 = 0.08;
 const ARC_SLACK: f32 = 0.15;
 /// Distance in voxel edges within which a cluster may be the receiver's own surface.
 const NEAR_VOXELS: f32 = 2.5;
+
+/// A cluster is a sheet with other things before it, as ground with trees is, if this share of its area faces one way ...
+const SHEET_SHARE: f32 = 0.6;
+/// ... and no more than this ...
+const SHEET_SHARE_MAX: f32 = 0.85;
+/// ... if the others' normals do not lie along its own (mean square sine), as those of another sheet would ...
+const OTHERS_SPREAD: f32 = 0.6;
+/// ... and if it lies this far behind the centroid, in voxel edges: nearer, it is a relief.
+const SHEET_DEPTH_MIN: f32 = 0.06;
 
 /// A uniform segment reaches the square root of three standard deviations.
 const UNIFORM_REACH: f32 = 1.732_051;
@@ -218,6 +230,37 @@ impl<'a> Cluster<'a> {
     }
 }
 
+/// A sheet with other things before it: most of a cluster's area, which faces one way and lies behind the rest.
+pub(crate) struct Sheet {
+    /// The way it faces.
+    pub(crate) axis: Vec3,
+    /// Where it lies along the axis, from the cluster's centroid; negative.
+    pub(crate) height: f32,
+    /// Radiance of the side that faces along the axis.
+    pub(crate) radiance: Vec3,
+    /// Share of the cluster's area.
+    share: f32,
+    area: f32,
+    /// Radiance times area.
+    power: Vec3,
+}
+
+impl Sheet {
+    /// Where the middle of what is before it lies along the axis, from the cluster's centroid.
+    #[inline(always)]
+    pub(crate) fn others_height(&self) -> f32 {
+        -self.height * self.share / (1.0 - self.share)
+    }
+
+    /// Cosines to unit directions, without and with their signs, as blurred as in sums of harmonics.
+    #[inline(always)]
+    fn cosines<F: Floats>(&self, direction: Vector<F>) -> [F; 2] {
+        let cosine = Vector::splat(self.axis).dot(direction);
+        let absolute = (cosine * cosine).mul_add(F::splat(SQUARED_COSINE), F::splat(CONSTANT_COSINE));
+        [absolute, cosine]
+    }
+}
+
 /// A cluster without a plane, seen from some directions.
 pub(crate) struct Shown<'a, F> {
     cluster: &'a Cluster<'a>,
@@ -239,6 +282,66 @@ impl<F: Floats> Shown<'_, F> {
         shown.max(F::splat(0.0)) * F::splat(self.cluster.normaliser) * self.visible()
     }
 
+    /// The sheet that most of it is, if the rest lies before that. What is not the sheet faces everywhere, so that sums over all discs
+    /// tell the sheet's area (of normals), its power (of normals times radiance), and where it lies (of places by squared cosines).
+    #[inline(always)]
+    pub(crate) fn sheet(&self) -> Option<Sheet> {
+        let cluster = self.cluster;
+        let spread_squared = cluster.spread * cluster.spread;
+        if cluster.fill < SECTION_FILL || spread_squared > 1.0 - SHEET_SHARE {
+            return None;
+        }
+        let facing = self.normals(0).dot(cluster.axis) * cluster.normaliser;
+        let axis = cluster.axis * 1f32.copysign(facing);
+        let area = facing.abs();
+        let share = area / cluster.area;
+        let others = 1.0 - share;
+        if !(SHEET_SHARE..SHEET_SHARE_MAX).contains(&share)
+            || share * cluster.fill < SECTION_FILL
+            || spread_squared < OTHERS_SPREAD * others
+        {
+            return None;
+        }
+        let along = Vector::<F>::splat(axis);
+        let [fold, ..] = self.fold(along).dot(along).to_array();
+        // The others' squared cosines make up for a part of it.
+        let height = fold * (others / spread_squared).max(1.0) / share;
+        if height > -SHEET_DEPTH_MIN * cluster.edge {
+            return None;
+        }
+        let [red, green, blue] = [self.normals(1), self.normals(2), self.normals(3)];
+        let power = Vec3::new(red.dot(axis), green.dot(axis), blue.dot(axis)).max(Vec3::ZERO) * cluster.normaliser;
+        Some(Sheet {
+            axis,
+            height,
+            // Where there is more than one layer the others are hidden, and unlit.
+            radiance: power / area.min(cluster.area / cluster.fill),
+            share,
+            area,
+            power,
+        })
+    }
+
+    /// Like [`Self::area`], of all but the sheet.
+    #[inline(always)]
+    pub(crate) fn area_without(&self, sheet: &Sheet, sides: HitSides) -> F {
+        let [absolute, cosine] = sheet.cosines(self.direction);
+        let part = match sides {
+            HitSides::Both => absolute,
+            HitSides::Front => (absolute + cosine) * F::splat(0.5),
+            HitSides::Back => (absolute - cosine) * F::splat(0.5),
+        };
+        self.area(sides) - part * F::splat(sheet.area) * self.visible()
+    }
+
+    /// Like [`Self::power`], of all but the sheet.
+    #[inline(always)]
+    pub(crate) fn power_without(&self, sheet: &Sheet) -> Vector<F> {
+        let [absolute, cosine] = sheet.cosines(self.direction);
+        let power = self.power() - Vector::splat(sheet.power) * ((absolute + cosine) * F::splat(0.5));
+        power.max(Vector::splat(Vec3::ZERO))
+    }
+
     /// Share that the cluster does not hide of itself: along an axis as the node says, between axes by the squares of the cosines.
     #[inline(always)]
     fn visible(&self) -> F {
@@ -252,11 +355,18 @@ impl<F: Floats> Shown<'_, F> {
     /// From the centroid of all discs to that of what is seen of them. A body hides half of itself; which half, normals do not tell.
     #[inline(always)]
     pub(crate) fn shift(&self) -> Vector<F> {
-        /// What the second band of `|cos|` adds to a constant, per squared cosine.
-        const SQUARED_COSINE: f32 = 15.0 / 16.0;
         let [even, _] = self.bands(0);
         let area = (even + even) * F::splat(self.cluster.normaliser);
-        let d = self.direction;
+        // Of what is never seen there is no middle.
+        let least = (1e-3 * self.cluster.area).max(f32::MIN_POSITIVE);
+        let scale = F::splat(SQUARED_COSINE * self.cluster.area) / area.max(F::splat(least));
+        let visible = self.visible();
+        self.fold(self.direction) * (scale * (visible + visible - F::splat(1.0)).max(F::splat(0.0)))
+    }
+
+    /// Mean place of its discs from their centroid, weighted by the squared cosines between their normals and unit directions.
+    #[inline(always)]
+    fn fold(&self, d: Vector<F>) -> Vector<F> {
         let (two, zz) = (F::splat(2.0), d.z * d.z);
         let terms = [
             d.x * d.x - zz,
@@ -266,16 +376,12 @@ impl<F: Floats> Shown<'_, F> {
             two * d.y * d.z,
         ];
         let [x, y, z] = self.cluster.node.folds();
-        // Of what is never seen there is no middle.
-        let least = (1e-3 * self.cluster.area).max(f32::MIN_POSITIVE);
-        let scale = F::splat(SQUARED_COSINE * self.cluster.edge * self.cluster.area) / area.max(F::splat(least));
-        let visible = self.visible();
-        let scale = scale * (visible + visible - F::splat(1.0)).max(F::splat(0.0));
-        Vector {
-            x: along(&terms, &x) * scale,
-            y: along(&terms, &y) * scale,
-            z: along(&terms, &z) * scale,
-        }
+        let sums = Vector {
+            x: along(&terms, &x),
+            y: along(&terms, &y),
+            z: along(&terms, &z),
+        };
+        sums * F::splat(self.cluster.edge)
     }
 
     /// Radiance times projected area.
@@ -297,10 +403,18 @@ impl<F: Floats> Shown<'_, F> {
     /// See [`pbgi_core::coverage::scattered`].
     #[inline(always)]
     pub(crate) fn scattered(&self) -> f32 {
-        let terms = &self.terms;
-        let normals = Vec3::new(terms[4], terms[8], terms[12]).length() / NORMAL_TERM;
-        let area = terms[0] / AREA_TERM;
-        scattered(normals / area.max(f32::MIN_POSITIVE))
+        let area = self.terms[0] / AREA_TERM;
+        scattered(self.normals(0).length() / area.max(f32::MIN_POSITIVE))
+    }
+
+    /// Sum over discs of normal times area, or times power of the front less that of the back; over the normaliser.
+    #[inline(always)]
+    fn normals(&self, channel: usize) -> Vec3 {
+        let [y, z, x] = [4, 8, 12].map(
+            #[inline(always)]
+            |term| self.terms[term + channel],
+        );
+        Vec3::new(x, y, z) / NORMAL_TERM
     }
 
     /// Sums of the even and of the odd bands of a channel.
@@ -427,4 +541,106 @@ pub(crate) fn orthonormal_pair<F: Floats>(n: Vector<F>) -> [Vector<F>; 2] {
             z: -n.y,
         },
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::ScalarFloats;
+    use pbgi_core::point::Sides;
+    use pbgi_core::{ClusterAccumulator, NodeKind, PointIndex, PointRecord, Quantizer, Voxel};
+
+    /// A layer of discs that together have `area`, in a voxel of edge 1 around the origin.
+    fn layer(height: f32, normal: Vec3, area: f32, radiance: f32) -> Vec<PointRecord> {
+        const SIDE: i32 = 20;
+        let place = |i: i32| (i as f32 + 0.5) / SIDE as f32 - 0.5;
+        let radius = (area / (SIDE * SIDE) as f32 / std::f32::consts::PI).sqrt();
+        let sides = Sides {
+            front: [radiance; 3],
+            back: [0.0; 3],
+        };
+        let point = |i: i32| {
+            let position = [place(i % SIDE), place(i / SIDE), height];
+            PointRecord::new(position, normal.to_array(), radius, sides).unwrap()
+        };
+        (0..SIDE * SIDE).map(point).collect()
+    }
+
+    fn node(layers: &[Vec<PointRecord>]) -> NodeRecord {
+        let quantizer = Quantizer {
+            origin: [-0.5; 3],
+            edge: 1.0,
+        };
+        let mut sum = ClusterAccumulator::default();
+        for point in layers.iter().flatten() {
+            sum.add(point, &quantizer);
+        }
+        let kind = NodeKind::Leaf {
+            first: PointIndex(0),
+            count: 1,
+        };
+        NodeRecord::new(0, kind, &sum.finalize(Voxel::ROOT, &quantizer).attributes)
+    }
+
+    fn sheet_of(node: &NodeRecord) -> Option<Sheet> {
+        let cluster = Cluster::new::<ScalarFloats>(node, 1.0);
+        cluster.toward(Vector::<ScalarFloats>::splat(Vec3::Z)).sheet()
+    }
+
+    /// Leaves of all directions, two layers high.
+    fn leaves(area: f32) -> [Vec<PointRecord>; 6] {
+        [Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y, Vec3::Z, Vec3::NEG_Z].map(|normal| {
+            let mut points = layer(0.0, normal, area / 12.0, 0.5);
+            points.extend(layer(0.4, normal, area / 12.0, 0.5));
+            points
+        })
+    }
+
+    #[test]
+    fn ground_below_leaves_is_told_from_them() {
+        let mut layers = vec![layer(-0.3, Vec3::Z, 1.0, 2.0)];
+        layers.extend(leaves(0.4));
+        let node = node(&layers);
+        let sheet = sheet_of(&node).unwrap();
+        // The centroid of 1.0 at -0.3 and 0.4 at 0.2.
+        let middle = -0.22 / 1.4;
+        assert!(sheet.axis.distance(Vec3::Z) < 1e-3);
+        assert!((sheet.area - 1.0).abs() < 0.01, "{}", sheet.area);
+        assert!((sheet.height - (-0.3 - middle)).abs() < 0.02, "{}", sheet.height);
+        assert!(
+            (sheet.others_height() - (0.2 - middle)).abs() < 0.05,
+            "{}",
+            sheet.others_height()
+        );
+        assert!(
+            (sheet.radiance - Vec3::splat(2.0)).abs().max_element() < 0.02,
+            "{}",
+            sheet.radiance
+        );
+        // From the side nothing is seen of the ground, but half of the leaves' area and a quarter of what their fronts send out.
+        let cluster = Cluster::new::<ScalarFloats>(&node, 1.0);
+        let shown = cluster.toward(Vector::<ScalarFloats>::splat(Vec3::X));
+        let [area, ..] = shown.area_without(&sheet, HitSides::Both).to_array();
+        let [visible, ..] = shown.visible().to_array();
+        assert!(
+            (area / visible - 0.2).abs() < 0.02,
+            "{area}, of which {visible} is seen"
+        );
+        let [power, ..] = shown.power_without(&sheet).x.to_array();
+        assert!((power - 0.05).abs() < 0.01, "{power}");
+    }
+
+    #[test]
+    fn walls_are_no_sheet_with_others_before_it() {
+        // One behind the other, back to back, and a relief.
+        let parallel = [layer(-0.3, Vec3::Z, 1.0, 1.0), layer(0.3, Vec3::Z, 0.3, 1.0)];
+        let opposite = [layer(-0.3, Vec3::Z, 1.0, 1.0), layer(0.3, Vec3::NEG_Z, 0.3, 1.0)];
+        let mut relief = vec![layer(-0.3, Vec3::Z, 1.0, 1.0)];
+        relief.extend([Vec3::X, Vec3::NEG_X].map(|normal| layer(-0.25, normal, 0.2, 1.0)));
+        for layers in [&parallel[..], &opposite[..], &relief[..]] {
+            assert!(sheet_of(&node(layers)).is_none());
+        }
+        // Leaves alone.
+        assert!(sheet_of(&node(&leaves(1.4))).is_none());
+    }
 }

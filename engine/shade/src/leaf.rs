@@ -208,7 +208,7 @@ fn disc_scale(points: &[PointRecord]) -> f32 {
         area += its_area;
         squares += its_area * its_area;
     }
-    DISC_SCALE + (1.0 - DISC_SCALE) * scattered_pairs(normal, area, squares) as f32
+    DISC_SCALE + (1.0 - DISC_SCALE) * scattered_pairs(normal.length_squared(), area, squares) as f32
 }
 
 /// How far a section's box reaches out of its voxel, as shares of half its edge: a plane along a face must not fall out of it

@@ -1,8 +1,8 @@
 //! Draws the elements of a cut into the raster and sums what they add, for eight receivers at a time.
 
-use crate::cluster::{Cluster, SAME_SHEET, SECTION_FILL, is_aligned, is_own_surface, orthonormal_pair, rectangle_of};
+use crate::cluster::{Cluster, SAME_SHEET, Sheet, is_aligned, is_own_surface, orthonormal_pair, rectangle_of};
 use crate::cut::{Pack, Sight, Visit, Walk};
-use crate::footprint::{Footprint, Plane};
+use crate::footprint::{Footprint, OF_SECTION, Plane};
 use crate::leaf::{Disc, Facet, Part};
 use crate::raster::{Covered, Ink, Raster};
 use crate::simd::{Floats, LANES, Words};
@@ -31,6 +31,8 @@ const OPAQUE_SHARE: f32 = 0.4;
 const WALL_SCALE: f32 = 1.2;
 /// ... if it covers this share of its rectangle.
 const WALL_SHARE: f32 = 0.7;
+/// Share of its rectangle that what is before a sheet covers at least.
+const LEAST_SHARE: f32 = 0.01;
 
 /// How much larger a round cluster is drawn than what it covers.
 #[inline(always)]
@@ -89,7 +91,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         lanes: u8,
     ) {
         if !cluster.flat {
-            self.draw_round(cluster, visit, centroid, lanes);
+            self.draw_round(cluster, visit, center, centroid, lanes);
             return;
         }
         let lanes = lanes & !cluster.own_surface(self.pack.frames.z, centroid, center);
@@ -110,12 +112,8 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
             #[inline(always)]
             |direction| cluster.depth(direction),
         );
-        let (covered, drawn_area) = if cluster.fill >= SECTION_FILL {
-            let (of_voxel, of_points) = cluster.section_reach();
-            let (of_voxel, of_points) = (Vector::splat(of_voxel), Vector::splat(of_points));
-            let low = (center - of_voxel).max(centroid - of_points);
-            let high = (center + of_voxel).min(centroid + of_points);
-            let section = Footprint::section(frames, low, high, &plane);
+        let (covered, drawn_area) = if cluster.fills_section() {
+            let section = self.section(cluster, center, centroid, &plane);
             let covered = self.cover(&section, lanes, None, weight, visit.path);
             (covered, F::splat(cluster.area / cluster.fill))
         } else {
@@ -141,12 +139,14 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         }
     }
 
-    /// A cluster without a plane: the rectangle of its covariance seen from the receiver, as wide as what it covers.
+    /// A cluster without a plane: the rectangle of its covariance seen from the receiver, as wide as what it covers. Where it is a
+    /// sheet with other things before it, that is drawn of these, and the sheet behind them.
     #[inline(always)]
-    fn draw_round(&mut self, cluster: &Cluster<'_>, visit: &Visit, centroid: Vector<F>, lanes: u8) {
+    fn draw_round(&mut self, cluster: &Cluster<'_>, visit: &Visit, center: Vector<F>, centroid: Vector<F>, lanes: u8) {
         let frames = &self.pack.frames;
         let distance = centroid.length_squared().sqrt();
         let apart = F::splat(1e-6 * visit.half).less(distance);
+        let lanes = lanes & apart.lanes();
         let direction = centroid * (F::splat(1.0) / distance);
         let shown = cluster.toward(-direction);
         let sides = self.walk.settings.hit_sides;
@@ -157,34 +157,92 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         let [(u, a), (v, b)] = rectangle_of(&cluster.covariance, direction);
         let tiny = F::splat(1e-30);
         let rectangle = (F::splat(4.0) * a * b).max(tiny);
-        let visible = shown.area(sides).min(rectangle).max(tiny);
+        let scattered = shown.scattered();
+        let sheet = shown.sheet();
+        let (area, middle) = match &sheet {
+            Some(sheet) => {
+                // A difference of roundings is no area.
+                let area = shown.area_without(sheet, sides).max(rectangle * F::splat(LEAST_SHARE));
+                (area, centroid + Vector::splat(sheet.axis * sheet.others_height()))
+            }
+            // Of leaves, chance says which are seen, not which way they face.
+            None if scattered < 1.0 => (shown.area(sides), centroid + shown.shift() * F::splat(1.0 - scattered)),
+            None => (shown.area(sides), centroid),
+        };
+        let visible = area.min(rectangle).max(tiny);
         let covered = visible / rectangle;
         let density = (covered * F::splat(1.0 / OPAQUE_SHARE)).min(F::splat(1.0));
-        let scattered = shown.scattered();
         let scale = wall_scale(covered, scattered) * covered.max(F::splat(OPAQUE_SHARE));
         let scale = scale.sqrt();
         let (a, b) = (a * scale, b * scale);
-        let sides = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
-        // Of leaves, chance says which are seen, not which way they face.
-        let middle = if scattered < 1.0 {
-            centroid + shown.shift() * F::splat(1.0 - scattered)
-        } else {
-            centroid
-        };
-        let footprint = Footprint::rectangle(frames.local_from_world(middle), &plane, sides);
+        let axes = [(frames.local_from_world(u), a), (frames.local_from_world(v), b)];
+        let footprint = Footprint::rectangle(frames.local_from_world(middle), &plane, axes);
         let weight = self.weight(
             centroid,
             #[inline(always)]
             |direction| cluster.depth(direction),
         );
-        let lanes = lanes & apart.lanes();
         let thin = density.less(F::splat(1.0)).lanes() & lanes != 0;
         let covered = self.cover(&footprint, lanes, thin.then_some(density), weight, visit.path);
         if let Some(covered) = covered {
             // What hides is taken to be as unlit as the insides of a body.
             let lit = covered.bits_set().select(covered.light / visible, F::splat(0.0));
-            self.radiance = self.radiance + shown.power() * lit;
+            let power = match &sheet {
+                Some(sheet) => shown.power_without(sheet),
+                None => shown.power(),
+            };
+            self.radiance = self.radiance + power * lit;
         }
+        if let Some(sheet) = sheet {
+            self.draw_sheet(cluster, &sheet, visit, center, centroid, lanes);
+        }
+    }
+
+    /// The sheet behind what else is in a cluster.
+    #[inline(always)]
+    fn draw_sheet(
+        &mut self,
+        cluster: &Cluster<'_>,
+        sheet: &Sheet,
+        visit: &Visit,
+        center: Vector<F>,
+        centroid: Vector<F>,
+        lanes: u8,
+    ) {
+        let frames = &self.pack.frames;
+        let axis = Vector::splat(sheet.axis);
+        let lanes = lanes & !cluster.own_surface(frames.z, centroid, center);
+        let lanes = self.hit(lanes, axis, centroid, || [1.0, 0.0]);
+        if lanes == 0 {
+            return;
+        }
+        let through = centroid + Vector::splat(sheet.axis * sheet.height);
+        let plane = Plane::through(frames, through, axis, TOUCH * visit.half);
+        let section = self.section(cluster, center, centroid, &plane);
+        let weight = self.weight(
+            through,
+            #[inline(always)]
+            |direction| cluster.depth(direction),
+        );
+        if let Some(covered) = self.cover(&section, lanes, None, weight, visit.path) {
+            self.add_light([sheet.radiance, Vec3::ZERO], axis, through, covered.light);
+        }
+    }
+
+    /// Where a plane cuts a cluster's voxel, as far as its points reach.
+    #[inline(always)]
+    fn section(
+        &self,
+        cluster: &Cluster<'_>,
+        center: Vector<F>,
+        centroid: Vector<F>,
+        plane: &Plane<F>,
+    ) -> Footprint<F, OF_SECTION> {
+        let (of_voxel, of_points) = cluster.section_reach();
+        let (of_voxel, of_points) = (Vector::splat(of_voxel), Vector::splat(of_points));
+        let low = (center - of_voxel).max(centroid - of_points);
+        let high = (center + of_voxel).min(centroid + of_points);
+        Footprint::section(&self.pack.frames, low, high, plane)
     }
 
     /// The parts of an opened leaf, in the order in which the walk would meet them had it gone on: by distance along the
