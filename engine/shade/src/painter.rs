@@ -2,7 +2,7 @@
 
 use crate::cluster::{Cluster, SAME_SHEET, Sheet, is_aligned, is_own_surface, orthonormal_pair, rectangle_of};
 use crate::cut::{Pack, Sight, Visit, Walk};
-use crate::footprint::{Footprint, OF_SECTION, Plane};
+use crate::footprint::{Footprint, Plane};
 use crate::leaf::{Disc, Facet, Part};
 use crate::raster::{Covered, Ink, Raster};
 use crate::simd::{Floats, LANES, Words};
@@ -90,30 +90,53 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
         centroid: Vector<F>,
         lanes: u8,
     ) {
-        if !cluster.flat {
-            self.draw_round(cluster, visit, center, centroid, lanes);
-            return;
-        }
+        let sheet = if cluster.flat {
+            None
+        } else {
+            match self.draw_round(cluster, visit, centroid, lanes) {
+                None => return,
+                sheet => sheet,
+            }
+        };
+        let axis = Vector::splat(sheet.as_ref().map_or(cluster.axis, |sheet| sheet.axis));
         let lanes = lanes & !cluster.own_surface(self.pack.frames.z, centroid, center);
-        let lanes = self.hit(lanes, Vector::splat(cluster.axis), centroid, || cluster.facing());
+        let lanes = self.hit(lanes, axis, centroid, || match sheet {
+            Some(_) => [1.0, 0.0],
+            None => cluster.facing(),
+        });
         if lanes != 0 {
-            self.draw_flat(cluster, visit, center, centroid, lanes);
+            self.draw_flat(cluster, sheet.as_ref(), visit, center, centroid, lanes);
         }
     }
 
-    /// A piece of a plane: the section of its voxel if it fills that, else the rectangle of its covariance.
+    /// A piece of a plane: the section of its voxel if it fills that, as a `sheet` behind other things does, else the rectangle of its
+    /// covariance.
     #[inline(always)]
-    fn draw_flat(&mut self, cluster: &Cluster<'_>, visit: &Visit, center: Vector<F>, centroid: Vector<F>, lanes: u8) {
+    fn draw_flat(
+        &mut self,
+        cluster: &Cluster<'_>,
+        sheet: Option<&Sheet>,
+        visit: &Visit,
+        center: Vector<F>,
+        centroid: Vector<F>,
+        lanes: u8,
+    ) {
         let frames = &self.pack.frames;
-        let axis = Vector::splat(cluster.axis);
-        let plane = Plane::through(frames, centroid, axis, TOUCH * visit.half);
+        let (axis, height) = sheet.map_or((cluster.axis, 0.0), |sheet| (sheet.axis, sheet.height));
+        let middle = centroid + Vector::splat(axis * height);
+        let axis = Vector::splat(axis);
+        let plane = Plane::through(frames, middle, axis, TOUCH * visit.half);
         let weight = self.weight(
-            centroid,
+            middle,
             #[inline(always)]
             |direction| cluster.depth(direction),
         );
-        let (covered, drawn_area) = if cluster.fills_section() {
-            let section = self.section(cluster, center, centroid, &plane);
+        let (covered, drawn_area) = if sheet.is_some() || cluster.fills_section() {
+            let (of_voxel, of_points) = cluster.section_reach();
+            let (of_voxel, of_points) = (Vector::splat(of_voxel), Vector::splat(of_points));
+            let low = (center - of_voxel).max(centroid - of_points);
+            let high = (center + of_voxel).min(centroid + of_points);
+            let section = Footprint::section(frames, low, high, &plane);
             let covered = self.cover(&section, lanes, None, weight, visit.path);
             (covered, F::splat(cluster.area / cluster.fill))
         } else {
@@ -127,22 +150,28 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
             let rectangle = Footprint::rectangle(frames.local_from_world(centroid), &plane, sides);
             (self.cover(&rectangle, lanes, None, weight, visit.path), four * a * b)
         };
-        if let Some(covered) = covered {
-            let powers = cluster.side_powers::<F>();
-            // One sheet shows all its area; of two the receiver sees the nearer.
-            let area = if cluster.fill > TWO_SHEETS_FILL {
-                drawn_area
-            } else {
-                F::splat(cluster.area)
-            };
-            self.add_light(powers, axis, centroid, covered.light / area);
+        let Some(covered) = covered else {
+            return;
+        };
+        match sheet {
+            Some(sheet) => self.add_light([sheet.radiance, Vec3::ZERO], axis, middle, covered.light),
+            None => {
+                let powers = cluster.side_powers::<F>();
+                // One sheet shows all its area; of two the receiver sees the nearer.
+                let area = if cluster.fill > TWO_SHEETS_FILL {
+                    drawn_area
+                } else {
+                    F::splat(cluster.area)
+                };
+                self.add_light(powers, axis, centroid, covered.light / area);
+            }
         }
     }
 
     /// A cluster without a plane: the rectangle of its covariance seen from the receiver, as wide as what it covers. Where it is a
-    /// sheet with other things before it, that is drawn of these, and the sheet behind them.
+    /// sheet with other things before it, that is drawn of these, and the sheet returned.
     #[inline(always)]
-    fn draw_round(&mut self, cluster: &Cluster<'_>, visit: &Visit, center: Vector<F>, centroid: Vector<F>, lanes: u8) {
+    fn draw_round(&mut self, cluster: &Cluster<'_>, visit: &Visit, centroid: Vector<F>, lanes: u8) -> Option<Sheet> {
         let frames = &self.pack.frames;
         let distance = centroid.length_squared().sqrt();
         let apart = F::splat(1e-6 * visit.half).less(distance);
@@ -193,56 +222,7 @@ impl<'a, F: Floats, const WORDS: usize> Painter<'a, F, WORDS> {
             };
             self.radiance = self.radiance + power * lit;
         }
-        if let Some(sheet) = sheet {
-            self.draw_sheet(cluster, &sheet, visit, center, centroid, lanes);
-        }
-    }
-
-    /// The sheet behind what else is in a cluster.
-    #[inline(always)]
-    fn draw_sheet(
-        &mut self,
-        cluster: &Cluster<'_>,
-        sheet: &Sheet,
-        visit: &Visit,
-        center: Vector<F>,
-        centroid: Vector<F>,
-        lanes: u8,
-    ) {
-        let frames = &self.pack.frames;
-        let axis = Vector::splat(sheet.axis);
-        let lanes = lanes & !cluster.own_surface(frames.z, centroid, center);
-        let lanes = self.hit(lanes, axis, centroid, || [1.0, 0.0]);
-        if lanes == 0 {
-            return;
-        }
-        let through = centroid + Vector::splat(sheet.axis * sheet.height);
-        let plane = Plane::through(frames, through, axis, TOUCH * visit.half);
-        let section = self.section(cluster, center, centroid, &plane);
-        let weight = self.weight(
-            through,
-            #[inline(always)]
-            |direction| cluster.depth(direction),
-        );
-        if let Some(covered) = self.cover(&section, lanes, None, weight, visit.path) {
-            self.add_light([sheet.radiance, Vec3::ZERO], axis, through, covered.light);
-        }
-    }
-
-    /// Where a plane cuts a cluster's voxel, as far as its points reach.
-    #[inline(always)]
-    fn section(
-        &self,
-        cluster: &Cluster<'_>,
-        center: Vector<F>,
-        centroid: Vector<F>,
-        plane: &Plane<F>,
-    ) -> Footprint<F, OF_SECTION> {
-        let (of_voxel, of_points) = cluster.section_reach();
-        let (of_voxel, of_points) = (Vector::splat(of_voxel), Vector::splat(of_points));
-        let low = (center - of_voxel).max(centroid - of_points);
-        let high = (center + of_voxel).min(centroid + of_points);
-        Footprint::section(&self.pack.frames, low, high, plane)
+        sheet
     }
 
     /// The parts of an opened leaf, in the order in which the walk would meet them had it gone on: by distance along the
